@@ -1,0 +1,1 @@
+"""Simulated drives and measurements of the method."""

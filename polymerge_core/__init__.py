@@ -1,0 +1,33 @@
+"""Merge many overlapping, imperfect digitisations of the same lines into one clean map."""
+
+from polymerge_core.errors import CrsError, InputError, OptionError, OutputError, PolymergeError, SchemaError
+from polymerge_core.figures import before_after
+from polymerge_core.formats import read_poses, read_predictions
+from polymerge_core.frames import project
+from polymerge_core.graph import merge_network, network_layers
+from polymerge_core.io import read_layers, read_local_maps, write_layers
+from polymerge_core.merge import MergeResult, merge
+from polymerge_core.schema import LocalMaps
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "CrsError",
+    "InputError",
+    "LocalMaps",
+    "MergeResult",
+    "OptionError",
+    "OutputError",
+    "PolymergeError",
+    "SchemaError",
+    "before_after",
+    "merge",
+    "merge_network",
+    "network_layers",
+    "project",
+    "read_layers",
+    "read_local_maps",
+    "read_poses",
+    "read_predictions",
+    "write_layers",
+]

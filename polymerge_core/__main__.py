@@ -1,0 +1,307 @@
+"""The command line: ``python -m polymerge_core``, or ``polymerge``. No geometry here."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+import geopandas as gpd
+import numpy as np
+
+import polymerge_core as pm
+from polymerge_core import console, demo
+from polymerge_core.environment import library_versions
+from polymerge_core.formats import read_matrix
+from polymerge_core.io import layer_targets, split_source, stage_layers
+from polymerge_core.options import AGGREGATES, INSTANCE_FROM, METHODS, Options
+from polymerge_core.outputs import StagedOutputs
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+def _decorate(*options: Callable[[_Command], _Command]) -> Callable[[_Command], _Command]:
+    def apply(command: _Command) -> _Command:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return apply
+
+
+_output = click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The file to write.")
+
+_run_options = _decorate(
+    click.option("--overwrite", is_flag=True, help="Replace existing outputs."),
+    click.option("--json", "report_file", metavar="FILE", help="Write a report as JSON; - for standard output."),
+    click.option("--progress", type=click.Choice(["auto", "json", "none"]), default="auto", show_default=True),
+    click.option("--watch-stdin", is_flag=True, help="Stop, leaving nothing behind, when standard input closes."),
+)
+
+_reading_options = _decorate(
+    click.option("--main-map", metavar="MAP", help="The map to merge into; its element_id are kept."),
+    click.option("--class-field", help="Column of the class.  [default: class, if there is one]"),
+    click.option("--class-name", default="line", show_default=True, help="The class where no column names one."),
+    click.option("--drive-field", help="Column of the drive or survey.  [default: drive, else the file's name]"),
+    click.option("--instance-field", help="Column of the local map (frame).  [default: instance, if there is one]"),
+    click.option("--instance-from", type=click.Choice(INSTANCE_FROM), help="What a local map is."),
+    click.option("--score-field", help="Column of the confidence, 0 to 1.  [default: score, else 1]"),
+    click.option("--min-score", type=float, default=0.0, show_default=True, help="Leave out what is under it."),
+    click.option("--timestamp-field", help="Column that orders the local maps.  [default: timestamp, if any]"),
+    click.option("--proximity", type=float, default=1.0, show_default=True, help="Th_prox in metres."),
+    click.option("--area", multiple=True, metavar="CLASS", help="A class of areas, beside ped_crossing; repeatable."),
+    click.option("--crs", help="CRS of layers without one, such as EPSG:32632, or local."),
+    click.option("--strict", is_flag=True, help="A feature that cannot be used is an error."),
+)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(pm.__version__, prog_name="polymerge")
+def cli() -> None:
+    """Merge many overlapping, imperfect digitisations of the same lines into one clean map."""
+
+
+@cli.command()
+@click.argument("predictions", type=click.Path())
+@click.option("--poses", required=True, type=click.Path(), help="Poses as CSV or JSON.")
+@click.option("--crs", required=True, help="CRS of the result, such as EPSG:32617, or local.")
+@click.option(
+    "--pose-kind",
+    type=click.Choice(["crs", "origin", "geodetic", "offset"]),
+    default="crs",
+    show_default=True,
+    help="What the poses are given in.",
+)
+@click.option("--origin", metavar="LAT,LON", help="Map origin in degrees, for --pose-kind origin.")
+@click.option("--pose-offset", metavar="E,N", help="Metres to add to the poses, for --pose-kind offset.")
+@click.option("--lidar-to-ego", metavar="FILE", help="4x4 matrix as JSON, for predictions in the LiDAR's frame.")
+@click.option(
+    "--footprint",
+    metavar="XMIN,YMIN,XMAX,YMAX",
+    default="-30,-15,30,15",
+    show_default=True,
+    help="What the predictor looks at, in the vehicle's frame, metres.",
+)
+@click.option("--drive", help="Name of the drive.  [default: the output's name]")
+@_output
+@_run_options
+def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None, **chosen: Any) -> None:
+    """Carry a predictor's local maps from the vehicle's frame into the world."""
+    run = _split_off(chosen)
+    for name, count in (("origin", 2), ("pose_offset", 2), ("footprint", 4)):
+        chosen[name] = _numbers(name, chosen[name], count)
+    chosen["drive"] = chosen["drive"] or output.stem
+    inputs = [predictions, poses, *([lidar_to_ego] if lidar_to_ego else [])]
+    with _Run(output, inputs, **run) as job:
+        job.progress(0.0, "reading the predictions")
+        seen = pm.read_predictions(predictions)
+        matrix = read_matrix(lidar_to_ego) if lidar_to_ego else None
+        job.progress(0.3, "reading the poses")
+        located = pm.read_poses(poses)
+        job.progress(0.4, "projecting")
+        local = pm.project(seen, located, lidar_to_ego=matrix, **chosen)
+        job.write(local.layers(), 0.6)
+        report = local.report()
+        job.report(report)
+    console.say(
+        f"{report['observations']} observations of {report['instances']} local maps"
+        f"{_left_out(report['left_out'])} -> {job.written}"
+    )
+
+
+@cli.command()
+@click.argument("local_maps", nargs=-1, required=True, metavar="LOCAL...")
+@_reading_options
+@click.option("--method", type=click.Choice(METHODS), default="polymerge", show_default=True)
+@click.option("--coverage", type=float, default=0.5, show_default=True, help="Th_cov, for area classes.")
+@click.option(
+    "--aggregate",
+    multiple=True,
+    metavar="[COLUMN=]FUNCTION",
+    help=f"How columns are carried: {', '.join(AGGREGATES)}; repeatable.  [default: first]",
+)
+@click.option("--out-crs", help="CRS of the result.  [default: the main map's, else the first layer's]")
+@_output
+@_run_options
+def merge(local_maps: tuple[str, ...], output: Path, main_map: str | None, **chosen: Any) -> None:
+    """Merge local maps (FILE, or FILE|layername=LAYER) into one map."""
+    run = _split_off(chosen)
+    chosen["aggregate"] = _aggregate(chosen["aggregate"])
+    Options.of(**chosen)  # a wrong value is told before anything is read
+    with _Run(output, [*local_maps, *([main_map] if main_map else [])], **run) as job:
+        job.progress(0.0, "reading the files")
+        layers = pm.read_local_maps(local_maps)
+        into = pm.read_local_maps([main_map]) if main_map else None
+        result = pm.merge(layers, into, progress=job.progress.part(0.05, 0.9), **chosen)
+        job.write(result.layers(), 0.9)
+        job.report(result.report)
+    report = result.report
+    for warning in report["warnings"]:
+        console.say(f"warning: {warning}")
+    into_what = f" and {report['main_map_elements']} elements of the main map" if main_map else ""
+    console.say(
+        f"{report['observations']} observations of {report['instances']} local maps{into_what} became "
+        f"{report['elements']} elements{_left_out(report['left_out'])} -> {job.written}"
+    )
+
+
+@cli.command()
+@click.argument("local_maps", nargs=-1, required=True, metavar="LOCAL...")
+@_reading_options
+@_output
+@_run_options
+def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **chosen: Any) -> None:
+    """Write who would be merged with whom: layers edges and observations."""
+    run = _split_off(chosen)
+    Options.of(**chosen)
+    with _Run(output, [*local_maps, *([main_map] if main_map else [])], **run) as job:
+        job.progress(0.0, "reading the files")
+        layers = pm.read_local_maps(local_maps)
+        into = pm.read_local_maps([main_map]) if main_map else None
+        graph = pm.merge_network(layers, into, progress=job.progress.part(0.05, 0.7), **chosen)
+        written = pm.network_layers(graph)
+        job.write(written, 0.8)
+        sizes = written["observations"]["component"].value_counts()
+        report = {
+            "observations": len(written["observations"]),
+            "edges": len(written["edges"]),
+            "components": len(sizes),
+            "largest_component": int(sizes.max()) if len(sizes) else 0,
+        }
+        job.report(report)
+    console.say(
+        f"{report['observations']} observations, {report['edges']} edges, {report['components']} components "
+        f"(the largest has {report['largest_component']}) -> {job.written}"
+    )
+
+
+@cli.command("demo")
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default="polymerge_demo")
+@click.option("--overwrite", is_flag=True, help="Replace the outputs of an earlier run.")
+def run_demo(folder: Path, *, overwrite: bool) -> None:
+    """Merge the sample, a simulated drive through a town junction, into FOLDER and draw it."""
+    click.echo(demo.run_demo(folder, overwrite=overwrite))
+
+
+@cli.command()
+def env() -> None:
+    """Print the versions of PolyMerge and of the libraries it runs on."""
+    click.echo(f"polymerge_core {pm.__version__}")
+    click.echo(f"Python {platform.python_version()} on {platform.platform()}")
+    for name, version in library_versions().items():
+        click.echo(f"{name} {version}")
+
+
+class _Run:
+    """One run of a command: its outputs appear together at the end, or not at all."""
+
+    def __init__(
+        self,
+        output: Path,
+        inputs: Sequence[str],
+        *,
+        overwrite: bool,
+        report_file: str | None,
+        progress: console.ProgressMode,
+        watch_stdin: bool,
+    ) -> None:
+        self._output, self._report_file = output, report_file
+        files = [split_source(path)[0] for path in inputs]
+        self._outputs = StagedOutputs(overwrite=overwrite, inputs=files)
+        report = [Path(report_file)] if report_file not in (None, "-") else []
+        # Which layers a run writes is known at its end; the main one is always there.
+        main = layer_targets(output, {"main": gpd.GeoDataFrame()})["main"]
+        self._outputs.check([main, *report])
+        self.progress = console.ProgressReport(progress)
+        self.written = str(output)
+        if watch_stdin:
+            console.watch_stdin()
+
+    def __enter__(self) -> _Run:  # noqa: PYI034 - typing.Self is newer than Python 3.10
+        self._outputs.__enter__()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        try:
+            self._outputs.__exit__(*error)  # type: ignore[arg-type]
+        finally:
+            self.progress.close()
+
+    def write(self, layers: dict[str, Any], fraction: float) -> None:
+        """Stage the layers; `fraction` is how far the run is when writing starts."""
+        self.progress(fraction, "writing")
+        done = stage_layers(self._outputs, self._output, layers)
+        self.written = ", ".join(path.name if path != self._output else str(path) for path in done.paths)
+        for layer, names in done.renamed.items():
+            for old, new in names.items():
+                console.say(f"column {old!r} of layer {layer!r} is called {new!r} in the file")
+        self.progress(1.0, "done")
+
+    def report(self, content: dict[str, Any]) -> None:
+        """Stage the JSON report, or print it where it goes to standard output."""
+        if self._report_file is None:
+            return
+        text = json.dumps(content, indent=2, ensure_ascii=False, default=_plain) + "\n"
+        if self._report_file == "-":
+            click.echo(text, nl=False)
+        else:
+            self._outputs.stage(self._report_file).write_text(text, encoding="utf-8")
+
+
+def _split_off(chosen: dict[str, Any]) -> dict[str, Any]:
+    """Take the options of `_Run` out of a command's options."""
+    return {name: chosen.pop(name) for name in ("overwrite", "report_file", "progress", "watch_stdin")}
+
+
+def _numbers(name: str, text: str | None, count: int) -> tuple[float, ...] | None:
+    """Read comma-separated numbers."""
+    if text is None:
+        return None
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        option = name.replace("_", "-")
+        raise pm.OptionError(
+            f"--{option} is {text!r}; it takes {count} numbers with commas between, such as "
+            f"{','.join('12.5' for _ in range(count))}"
+        )
+    return numbers
+
+
+def _aggregate(chosen: tuple[str, ...]) -> str | dict[str, str]:
+    """Read ``FUNCTION`` or ``COLUMN=FUNCTION``, the latter any number of times."""
+    plain = [entry for entry in chosen if "=" not in entry]
+    if plain and len(chosen) > 1:
+        raise pm.OptionError("--aggregate takes one function for all columns, or COLUMN=FUNCTION for each")
+    if plain:
+        return plain[0]
+    return dict(entry.rsplit("=", 1) for entry in chosen) or "first"
+
+
+def _left_out(reasons: dict[str, int]) -> str:
+    if not reasons:
+        return ""
+    listed = ", ".join(f"{reason}: {count}" for reason, count in sorted(reasons.items()))
+    return f"; {sum(reasons.values())} left out ({listed})"
+
+
+def _plain(value: Any) -> Any:
+    """Turn numpy's numbers into JSON's."""
+    if isinstance(value, np.generic):
+        return value.item()
+    return str(value)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    return console.run(cli, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,307 @@
+"""Reading the columns of the layer contract: class, drive, instance, score, timestamp, sigma.
+
+What the user did not name is looked for under its default name, and has a default of its own where it is
+missing. What the user named must be there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from polymerge_core.errors import SchemaError
+from polymerge_core.options import Options
+from polymerge_core.schema import ELEMENT_COLUMNS, LocalMaps, find_column
+
+#: Order of an observation without a timestamp: after all that have one.
+NO_TIMESTAMP = np.iinfo(np.int64).max
+
+_POINT_TYPES = {"Point", "MultiPoint"}
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One input layer and its part in the merge."""
+
+    maps: LocalMaps
+    is_main: bool
+
+    @property
+    def data(self) -> gpd.GeoDataFrame:
+        """The observations."""
+        return self.maps.observations
+
+    @property
+    def where(self) -> str:
+        """The layer in words, for messages."""
+        return f"{'main map' if self.is_main else 'layer'} {self.maps.source!r}"
+
+
+def read_columns(layers: Sequence[Layer], options: Options) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:
+    """Read every layer into one table of features with the contract's columns.
+
+    Parameters
+    ----------
+    layers : sequence of Layer
+        The main map, if any, first.
+    options : Options
+        Which columns hold what.
+
+    Returns
+    -------
+    features : DataFrame
+        `layer`, `source`, `source_fid`, `is_main`, `class`, `drive`, `instance`, `instance_kind`, `score`, `sigma`,
+        `timestamp_ns`, `main_id`, `weight`, `looks`, `shape`, `reason` (why it is left out, else None).
+    attributes : DataFrame
+        The user's own columns, row by row.
+    notes : dict
+        `instance_from` of each source and `warnings`.
+
+    Raises
+    ------
+    SchemaError
+        If a named column is missing, or a column cannot be what it is named for.
+    """
+    count = sum(not layer.is_main for layer in layers)
+    notes: dict[str, Any] = {"instance_from": {}, "warnings": []}
+    features, attributes = [], []
+    for number, layer in enumerate(layers):
+        _check_layer(layer)
+        table, used = _features(layer, options, several=count > 1, notes=notes)
+        features.append(table.assign(layer=number))
+        attributes.append(_user_columns(layer, used))
+    merged = pd.concat(features, ignore_index=True)
+    _check_ids(merged.loc[merged["main_id"] >= 0, ["source", "main_id"]])
+    _note_classes_alike(merged["class"], notes)
+    return merged, _join_attributes(attributes, notes), notes
+
+
+def _check_layer(layer: Layer) -> None:
+    data = layer.data
+    if not isinstance(data, gpd.GeoDataFrame):
+        raise SchemaError(f"{layer.where}: not a GeoDataFrame but {type(data).__name__}")
+    if data.active_geometry_name is None:
+        raise SchemaError(f"{layer.where}: the GeoDataFrame has no geometry column")
+    kinds = set(data.geometry.geom_type.dropna().unique())
+    if kinds and kinds <= _POINT_TYPES:
+        raise SchemaError(f"{layer.where}: the layer holds points; PolyMerge merges lines and polygons")
+
+
+def _features(layer: Layer, options: Options, *, several: bool, notes: dict[str, Any]) -> tuple[pd.DataFrame, set[str]]:
+    """Read one layer; return its features and the names of the columns that were understood."""
+    data, source = layer.data, layer.maps.source
+    find = _Finder(layer, options)
+    table = pd.DataFrame(
+        {
+            "source": source,
+            "source_fid": data.index.to_numpy(),
+            "is_main": layer.is_main,
+            "shape": data.geometry.to_numpy(),
+            "reason": np.full(len(data), None, dtype=object),
+        }
+    )
+    table["shape"] = table["shape"].astype(object)
+    table["class"] = _read_class(find, options, table)
+    table["drive"] = _read_text(find("drive", options.drive_field), default=source)
+    _read_instance(find, layer, options, table, several=several, notes=notes)
+    _read_score(find, options, table)
+    table["timestamp_ns"] = _read_timestamp(find("timestamp", options.timestamp_field), layer.where)
+    sigma = find("sigma", None)
+    table["sigma"] = np.nan if sigma is None else pd.to_numeric(sigma, errors="coerce").to_numpy(dtype=float)
+    _read_main(find, layer, table)
+    return table, find.used
+
+
+class _Finder:
+    """Looks columns up by name and remembers which were understood."""
+
+    def __init__(self, layer: Layer, options: Options) -> None:
+        self.layer, self.options = layer, options
+        self.used: set[str] = set()
+
+    def __call__(self, default: str, name: str | None) -> pd.Series | None:
+        data = self.layer.data
+        # The main map has the contract's own columns, whatever the local maps call theirs.
+        named = name is not None and not self.layer.is_main
+        columns = [column for column in data.columns if column != data.active_geometry_name]
+        found = find_column(columns, name if named and name else default, named=named, where=self.layer.where)
+        if found is None:
+            return None
+        self.used.add(found)
+        return pd.Series(data[found].to_numpy(), dtype=data[found].dtype)
+
+
+def _read_class(find: _Finder, options: Options, table: pd.DataFrame) -> pd.Series:
+    column = find("class", options.class_field)
+    if column is None:
+        return pd.Series(options.class_name, index=table.index, dtype=object)
+    missing = column.isna().to_numpy()
+    _leave_out(table, missing, "no class")
+    return _as_text(column).where(~missing, "")
+
+
+def _read_instance(
+    find: _Finder, layer: Layer, options: Options, table: pd.DataFrame, *, several: bool, notes: dict[str, Any]
+) -> None:
+    """Decide what a local map is: the column's value, the whole layer, or each feature."""
+    wanted = options.instance_from
+    column = None
+    if not layer.is_main and wanted in (None, "column"):
+        needed = "instance" if wanted == "column" else None
+        column = find("instance", options.instance_field or needed)
+    if layer.is_main:
+        rule = "layer"
+    elif column is not None:
+        rule = "column"
+    else:
+        rule = wanted or ("layer" if several else "feature")
+    if column is not None:
+        missing = column.isna().to_numpy()
+        _leave_out(table, missing, "no instance")
+        table["instance"] = _as_text(column).where(~missing, "")
+    elif rule == "layer":
+        table["instance"] = layer.maps.source
+    else:
+        table["instance"] = table["source_fid"].astype(str)
+    table["instance_kind"] = rule
+    if not layer.is_main:
+        notes["instance_from"][layer.maps.source] = rule
+
+
+def _read_score(find: _Finder, options: Options, table: pd.DataFrame) -> None:
+    column = find("score", options.score_field)
+    if column is None:
+        table["score"] = 1.0
+        return
+    score = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
+    table["score"] = score
+    if find.layer.is_main:
+        table["score"] = np.where(np.isfinite(score), score, 1.0)
+        return
+    _leave_out(table, ~np.isfinite(score), "the score is not a number")
+    _leave_out(table, (score < 0) | (score > 1), "the score is not between 0 and 1")
+    _leave_out(table, score < options.min_score, f"the score is under min_score ({options.min_score:g})")
+
+
+def _read_timestamp(column: pd.Series | None, where: str) -> NDArray[np.int64] | int:
+    """Return integer nanoseconds, `NO_TIMESTAMP` where there is none."""
+    if column is None:
+        return NO_TIMESTAMP
+    missing = column.isna()
+    if pd.api.types.is_bool_dtype(column):
+        raise SchemaError(f"{where}: the column {column.name!r} of timestamps holds true and false")
+    if pd.api.types.is_integer_dtype(column):
+        return column.astype("Int64").fillna(NO_TIMESTAMP).to_numpy(dtype=np.int64)
+    if pd.api.types.is_float_dtype(column):
+        return np.where(missing, NO_TIMESTAMP, column.fillna(0).to_numpy()).astype(np.int64)
+    times = pd.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
+    unread = times.isna() & ~missing
+    if unread.any():
+        raise SchemaError(
+            f"{where}: {column[unread].iloc[0]!r} is not a timestamp; timestamps are dates with times, or integer "
+            "nanoseconds (name another column with timestamp_field)"
+        )
+    nanoseconds = times.dt.tz_localize(None).to_numpy(dtype="datetime64[ns]").astype(np.int64)
+    return np.where(missing, NO_TIMESTAMP, nanoseconds)
+
+
+def _read_main(find: _Finder, layer: Layer, table: pd.DataFrame) -> None:
+    """Read what a map says of its own elements: ids, and how many observations and instances they stand for."""
+    table["main_id"], table["weight"], table["looks"] = -1, 1, 1
+    if not layer.is_main:
+        return
+    ids = find("element_id", None)
+    if ids is None:
+        ids = find("elem_id", None)
+    if ids is not None:
+        numbers = pd.to_numeric(ids, errors="coerce")
+        if numbers.isna().any() or (numbers % 1 != 0).any() or (numbers < 0).any():
+            raise SchemaError(f"{layer.where}: element_id holds something other than whole numbers")
+        table["main_id"] = numbers.astype(np.int64).to_numpy()
+    for name, short, column in (("n_observations", "n_obs", "weight"), ("n_instances", "n_inst", "looks")):
+        values = find(name, None)
+        values = find(short, None) if values is None else values
+        if values is not None:
+            count = pd.to_numeric(values, errors="coerce").fillna(1).to_numpy(dtype=float)
+            table[column] = np.maximum(count, 1).astype(np.int64)
+
+
+def _check_ids(known: pd.DataFrame) -> None:
+    twice = known[known["main_id"].duplicated()]
+    if len(twice):
+        source, number = twice.iloc[0]
+        raise SchemaError(f"main map {source!r}: element_id {number} occurs more than once; ids must be unique")
+
+
+def _user_columns(layer: Layer, used: set[str]) -> pd.DataFrame:
+    """Return the columns that are the user's own."""
+    ours = {name.lower() for name in ELEMENT_COLUMNS}
+    columns = [
+        column
+        for column in layer.data.columns
+        if column not in used and column != layer.data.active_geometry_name and str(column).lower() not in ours
+    ]
+    return pd.DataFrame(layer.data[columns]).reset_index(drop=True)
+
+
+def _join_attributes(tables: list[pd.DataFrame], notes: dict[str, Any]) -> pd.DataFrame:
+    """Bring the user's columns of all layers together; where types clash, values become text."""
+    kinds: dict[str, set[str]] = {}
+    for table in tables:
+        for name, dtype in table.dtypes.items():
+            kinds.setdefault(str(name), set()).add(_kind(dtype))
+    clashing = sorted(name for name, found in kinds.items() if len(found) > 1)
+    if clashing:
+        notes["warnings"].append(f"columns of different types became text: {', '.join(clashing)}")
+    cast = [table.assign(**{name: _as_text(table[name]) for name in clashing if name in table}) for table in tables]
+    # Not every layer has every column; int64 would turn to float where one is missing.
+    return pd.concat([_nullable(table) for table in cast], ignore_index=True)
+
+
+def _kind(dtype: Any) -> str:
+    if pd.api.types.is_bool_dtype(dtype):
+        return "bool"
+    if pd.api.types.is_numeric_dtype(dtype):
+        return "number"
+    return "time" if pd.api.types.is_datetime64_any_dtype(dtype) else "text"
+
+
+def _nullable(table: pd.DataFrame) -> pd.DataFrame:
+    integers = {name: "Int64" for name, dtype in table.dtypes.items() if pd.api.types.is_integer_dtype(dtype)}
+    return table.astype(integers)
+
+
+def _note_classes_alike(classes: pd.Series, notes: dict[str, Any]) -> None:
+    names = sorted(set(classes.dropna()))
+    folded: dict[str, list[str]] = {}
+    for name in names:
+        folded.setdefault(name.strip().lower(), []).append(name)
+    for alike in folded.values():
+        if len(alike) > 1:
+            notes["warnings"].append(f"the classes {', '.join(map(repr, alike))} are not merged with each other")
+
+
+def _read_text(column: pd.Series | None, *, default: str) -> pd.Series | str:
+    if column is None:
+        return default
+    return _as_text(column).where(column.notna(), default)
+
+
+def _as_text(column: pd.Series) -> pd.Series:
+    """Return values as text; whole numbers without a decimal point, whatever type a format gave them."""
+    if pd.api.types.is_float_dtype(column) and (column.dropna() % 1 == 0).all():
+        column = column.astype("Int64")
+    return column.astype(object).where(column.notna(), None).map(str, na_action="ignore").astype(object)
+
+
+def _leave_out(table: pd.DataFrame, chosen: NDArray[np.bool_], reason: str) -> None:
+    """Give a reason to the chosen features that have none yet, in place."""
+    reasons = table["reason"].to_numpy(dtype=object, copy=True)
+    reasons[np.asarray(chosen, dtype=bool) & pd.isna(reasons)] = reason
+    table["reason"] = reasons

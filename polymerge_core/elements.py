@@ -1,0 +1,170 @@
+"""From merged shapes to the merged map: ids, columns, types of geometry, and who went into what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+from polymerge_core.crs import transform_coordinates
+from polymerge_core.errors import OptionError
+from polymerge_core.observations import Observations, as_lines
+from polymerge_core.options import Options
+from polymerge_core.schema import LINEAGE_COLUMNS
+from polymerge_core.sets import ElementSets
+
+
+def build_elements(
+    observations: Observations, sets: ElementSets, shapes: NDArray[np.object_], options: Options
+) -> tuple[gpd.GeoDataFrame, NDArray[np.int64], pd.DataFrame]:
+    """Turn merged shapes into the layer `elements`.
+
+    Parameters
+    ----------
+    observations : Observations
+        What was merged.
+    sets : ElementSets
+        Which observations became one element.
+    shapes : ndarray of shapely geometries, shape (m,)
+        The merged shape of each component, in the working CRS; areas as polygons.
+    options : Options
+        How the user's columns are carried.
+
+    Returns
+    -------
+    elements : GeoDataFrame
+        Ordered by `element_id`, in the output CRS.
+    ids : ndarray of int, shape (m,)
+        The `element_id` of each component.
+    aliases : DataFrame
+        `old_id`, `element_id` of the main map's ids that are no more.
+    """
+    table, component, base = observations.table, sets.component, sets.base
+    ids, aliases = _assign_ids(table, component, base, shapes)
+    weight = table["weight"].to_numpy(dtype=float)
+    total = np.bincount(component, weight, len(base))
+    columns = {
+        "element_id": ids,
+        "class": table["class"].to_numpy()[base],
+        "score": np.bincount(component, weight * table["score"].to_numpy(), len(base)) / np.maximum(total, 1),
+        "n_observations": total.astype(np.int64),
+        "n_instances": _count_instances(table, component, len(base)),
+        "length_m": shapely.length(shapes),
+    }
+    attributes = _carry_columns(observations.attributes, component, base, options.aggregate)
+    geometry = _output_geometry(observations, component, base, shapes)
+    frame = pd.concat([pd.DataFrame(columns), attributes], axis=1)
+    elements = gpd.GeoDataFrame(frame, geometry=geometry, crs=observations.out_crs)
+    return elements.sort_values("element_id").reset_index(drop=True), ids, aliases
+
+
+def build_lineage(observations: Observations, sets: ElementSets, ids: NDArray[np.int64]) -> pd.DataFrame:
+    """List which interval of which observation went into which element.
+
+    Parameters
+    ----------
+    observations : Observations
+        What was merged.
+    sets : ElementSets
+        Which observations became one element.
+    ids : ndarray of int, shape (m,)
+        The `element_id` of each set.
+
+    Returns
+    -------
+    DataFrame
+        `LINEAGE_COLUMNS`; the weight is 1/n for each of the n observations of an element.
+    """
+    size = np.diff(sets.bounds)[sets.component]
+    table = observations.table.assign(element_id=ids[sets.component], weight=1.0 / size)
+    ordered = table.sort_values("element_id", kind="stable")
+    return ordered[list(LINEAGE_COLUMNS)].reset_index(drop=True)
+
+
+def _assign_ids(
+    table: pd.DataFrame, component: NDArray[np.intp], base: NDArray[np.intp], shapes: NDArray[np.object_]
+) -> tuple[NDArray[np.int64], pd.DataFrame]:
+    """Keep the smallest id of the main map in each component; number the rest in canonical order."""
+    known = pd.DataFrame({"old_id": table["main_id"], "component": component})
+    # The parts of one multi-part element share its id; only the first keeps it.
+    known = known[known["old_id"] >= 0].drop_duplicates("old_id")
+    kept = known.groupby("component")["old_id"].min()
+    ids = np.full(len(base), -1, dtype=np.int64)
+    ids[kept.index] = kept.to_numpy()
+    fresh = np.flatnonzero(ids < 0)
+    _, key = np.unique(shapely.to_wkb(shapely.normalize(shapes[fresh])), return_inverse=True)
+    _, name = np.unique(table["class"].to_numpy(dtype=str)[base[fresh]], return_inverse=True)
+    order = fresh[np.lexsort((base[fresh], key, name))]
+    highest = int(known["old_id"].max()) if len(known) else 0
+    ids[order] = highest + 1 + np.arange(len(order))
+    aliases = known.assign(element_id=ids[known["component"]])
+    aliases = aliases.loc[aliases["old_id"] != aliases["element_id"], ["old_id", "element_id"]]
+    return ids, aliases.astype(np.int64).sort_values("old_id").reset_index(drop=True)
+
+
+def _count_instances(table: pd.DataFrame, component: NDArray[np.intp], count: int) -> NDArray[np.int64]:
+    """Count the local maps in each component; a main map's element brings its own count."""
+    seen = pd.DataFrame({"component": component, "group": table["group"], "looks": table["looks"]})
+    distinct = seen[seen["group"] >= 0].drop_duplicates(["component", "group"])
+    looks = seen[seen["group"] < 0]
+    local = np.bincount(distinct["component"], minlength=count)
+    return (local + np.bincount(looks["component"], looks["looks"], count)).astype(np.int64)
+
+
+def _carry_columns(
+    attributes: pd.DataFrame, component: NDArray[np.intp], base: NDArray[np.intp], aggregate: str | Mapping[str, str]
+) -> pd.DataFrame:
+    """Carry the user's columns from observations to elements."""
+    chosen = _chosen_functions(attributes, aggregate)
+    carried = attributes.iloc[base].reset_index(drop=True)
+    for name, function in chosen.items():
+        if function == "first":
+            continue
+        groups = attributes[name].groupby(component)
+        values = _mode(attributes[name], component) if function == "mode" else groups.agg(function)
+        carried[name] = values.reindex(range(len(base))).to_numpy()
+    return carried
+
+
+def _chosen_functions(attributes: pd.DataFrame, aggregate: str | Mapping[str, str]) -> dict[str, str]:
+    numeric = {str(name) for name in attributes.columns if pd.api.types.is_numeric_dtype(attributes[name])}
+    if isinstance(aggregate, str):
+        # One function for all columns: means and sums are for the columns that have them.
+        only_numbers = aggregate in ("mean", "sum", "min", "max")
+        return {str(name): aggregate for name in attributes.columns if str(name) in numeric or not only_numbers}
+    for name, function in aggregate.items():
+        if name not in attributes.columns:
+            known = ", ".join(map(str, attributes.columns)) or "none"
+            raise OptionError(f"aggregate names the column {name!r}, which is not there; the columns are {known}")
+        if function in ("mean", "sum") and name not in numeric:
+            raise OptionError(f"aggregate cannot take the {function} of {name!r}: the column holds no numbers")
+    return dict(aggregate)
+
+
+def _mode(values: pd.Series[Any], component: NDArray[np.intp]) -> pd.Series[Any]:
+    """Return the most frequent value of each component, the smallest where several are as frequent."""
+    counted = values.groupby([component, values]).size().rename("count").reset_index(names=["component", "value"])
+    counted = counted.sort_values(["component", "count", "value"], ascending=[True, False, True])
+    return counted.drop_duplicates("component").set_index("component")["value"]
+
+
+def _output_geometry(
+    observations: Observations, component: NDArray[np.intp], base: NDArray[np.intp], shapes: NDArray[np.object_]
+) -> NDArray[np.object_]:
+    """Carry shapes to the output CRS; what nothing was merged into comes out bit for bit as it came in."""
+    table, work, out = observations.table, observations.crs, observations.out_crs
+    geometry = shapes.copy()
+    if work != out:
+        geometry = shapely.transform(geometry, lambda xy: transform_coordinates(xy, work, out))
+    same_crs = np.array([crs == out for crs in observations.layer_crs], dtype=bool)
+    alone = np.bincount(component, minlength=len(base)) == 1
+    untouched = alone & same_crs[table["layer"].to_numpy()[base]] if len(base) else alone
+    geometry[untouched] = table["original"].to_numpy()[base[untouched]]
+    as_polygon = table["as_polygon"].to_numpy()[base]
+    geometry[~as_polygon] = as_lines(geometry[~as_polygon])
+    return geometry

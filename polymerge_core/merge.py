@@ -1,0 +1,288 @@
+"""The published method from layers to a map: network, then one element from each connected component.
+
+The order of the steps is the paper's (section II-B): concatenate the local maps and the main map, find who is
+to be merged with whom, class by class, and merge each connected set under its class. Every observation
+ends in an element (table `lineage`) or among those left out (table `left_out`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+from polymerge_core.area import merge_areas
+from polymerge_core.batch import PolylineSets, merge_sets
+from polymerge_core.crs import crs_name
+from polymerge_core.elements import build_elements, build_lineage
+from polymerge_core.observations import Observations
+from polymerge_core.options import Options
+from polymerge_core.schema import (
+    ALIASES_TABLE,
+    AREAS_LAYER,
+    ELEMENTS_LAYER,
+    LEFT_OUT_TABLE,
+    LINEAGE_TABLE,
+)
+from polymerge_core.sets import ElementSets, Input, Progress, find_network, order_sets
+
+
+@dataclass(frozen=True)
+class MergeResult:
+    """What a merge gives.
+
+    Parameters
+    ----------
+    elements : GeoDataFrame
+        The merged map: `element_id`, `class`, `score`, `n_observations`, `n_instances`, `length_m`, the user's columns,
+        geometry in the type in which it came, in the output CRS; ordered by `element_id`.
+    lineage : DataFrame
+        Which interval (metres along the source feature) of which observation went into which element.
+    left_out : DataFrame
+        What is in no element, with a reason. With `lineage` it covers each observation exactly once.
+    id_aliases : DataFrame
+        Ids of main-map elements that became part of another one: `old_id`, `element_id`.
+    report : dict
+        Counts, options, CRSs and warnings; ready for JSON.
+    """
+
+    elements: gpd.GeoDataFrame
+    lineage: pd.DataFrame
+    left_out: pd.DataFrame
+    id_aliases: pd.DataFrame
+    report: dict[str, Any]
+
+    def layers(self) -> dict[str, pd.DataFrame]:
+        """Return what there is by layer name, ready for `polymerge_core.write_layers`.
+
+        Returns
+        -------
+        dict of GeoDataFrame and DataFrame
+            `elements`, the tables, and, where the map holds polygons beside lines, the polygons apart in
+            `elements_areas`: the formats hold one type of geometry.
+        """
+        polygon = self.elements.geom_type == "Polygon"
+        layers = {ELEMENTS_LAYER: self.elements}
+        if polygon.any() and not polygon.all():
+            layers = {ELEMENTS_LAYER: self.elements[~polygon], AREAS_LAYER: self.elements[polygon]}
+        tables = {LINEAGE_TABLE: self.lineage, LEFT_OUT_TABLE: self.left_out, ALIASES_TABLE: self.id_aliases}
+        return layers | tables
+
+
+def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know it
+    local_maps: Input,
+    main_map: Input | None = None,
+    *,
+    class_field: str | None = None,
+    class_name: str = "line",
+    drive_field: str | None = None,
+    instance_field: str | None = None,
+    instance_from: str | None = None,
+    score_field: str | None = None,
+    min_score: float = 0.0,
+    timestamp_field: str | None = None,
+    method: str = "polymerge",
+    proximity: float = 1.0,
+    coverage: float = 0.5,
+    area: str | Sequence[str] = (),
+    aggregate: str | Mapping[str, str] = "first",
+    crs: Any = None,
+    out_crs: Any = None,
+    strict: bool = False,
+    progress: Progress | None = None,
+) -> MergeResult:
+    """Merge local maps into one map.
+
+    Parameters
+    ----------
+    local_maps : GeoDataFrame, LocalMaps, or sequence of them
+        Lines or polygons in any CRS; one observation a row. The inputs are not changed.
+    main_map : GeoDataFrame, LocalMaps, or sequence of them, optional
+        The map to merge into; its `element_id` are kept. Lines and areas may come as two
+        layers. Without one, the first instance plays its part.
+    class_field : str, optional
+        Column of the class, `class` by default. Only observations of one class are merged.
+    class_name : str, default "line"
+        The class of everything where there is no class column.
+    drive_field, instance_field : str, optional
+        Columns that tell which local map an observation belongs to, `drive` and `instance` by default.
+    instance_from : {"column", "layer", "feature"}, optional
+        What a local map is. By default the instance column; without one each layer where there are several,
+        each feature where there is one.
+    score_field : str, optional
+        Column of the predictor's confidence, `score` by default; 1 where there is none.
+    min_score : float, default 0
+        Observations under it are left out (the paper uses 0.8).
+    timestamp_field : str, optional
+        Column that orders the instances, `timestamp` by default: dates with times, or integer nanoseconds.
+    method : {"polymerge"}, default "polymerge"
+        How a set of observations becomes one element: "polymerge" as published.
+    proximity : float, default 1.0
+        Th_prox, metres: polylines with a vertex nearer than this to each other are merged.
+    coverage : float, default 0.5
+        Th_cov, for area classes: the share of areas that must cover a place.
+    area : str or sequence of str, optional
+        Classes that are areas, beside `ped_crossing`. Polygons of other classes are areas too, but for those of
+        the classes `divider` and `boundary`.
+    aggregate : str or mapping, default "first"
+        How the user's columns are carried: `first` (the base observation's), `mode`, `mean`, `min`, `max` or
+        `sum`; one for all columns, or by column name.
+    crs : any, optional
+        CRS of layers without one, or "local" for plain metric coordinates.
+    out_crs : any, optional
+        CRS of the result; the main map's, else the first layer's by default.
+    strict : bool, default False
+        Whether a feature that has to be left out is an error.
+    progress : callable, optional
+        Called with the fraction done and a message; may raise to stop the work.
+
+    Returns
+    -------
+    MergeResult
+        Elements, lineage, left-out, id aliases and report.
+
+    Raises
+    ------
+    OptionError
+        If an option has a value that it cannot have.
+    SchemaError, CrsError, InputError
+        If a layer cannot be used.
+
+    References
+    ----------
+    Sayed, Perminov, Tsetserukou, "PolyMerge: A Novel Technique aimed at Dynamic HD Map Updates Leveraging
+    Polylines", section II-B.
+
+    Examples
+    --------
+    >>> import geopandas as gpd
+    >>> from shapely import LineString
+    >>> looks = gpd.GeoSeries([LineString([(0, 0), (9, 0)]), LineString([(1, 0.5), (8, -0.5)])])
+    >>> merge(looks, crs="local").elements.geometry.to_wkt().tolist()
+    ['LINESTRING (0 0, 1 0.25, 8 -0.25, 9 0)']
+    """
+    options = Options.of(
+        class_field=class_field,
+        class_name=class_name,
+        drive_field=drive_field,
+        instance_field=instance_field,
+        instance_from=instance_from,
+        score_field=score_field,
+        min_score=min_score,
+        timestamp_field=timestamp_field,
+        method=method,
+        proximity=proximity,
+        coverage=coverage,
+        area=area,
+        aggregate=aggregate,
+        crs=crs,
+        out_crs=out_crs,
+        strict=strict,
+    )
+    report_progress = progress or (lambda _fraction, _message: None)
+    network = find_network(local_maps, main_map, options, report_progress, distances=False)
+    sets = order_sets(network)
+    shapes, lowered = _merge_shapes(network.observations, sets, options, report_progress)
+    report_progress(0.95, "writing the tables")
+    elements, ids, aliases = build_elements(network.observations, sets, shapes, options)
+    lineage = build_lineage(network.observations, sets, ids)
+    report = _report(network.observations, sets, elements, options, lowered=lowered)
+    report_progress(1.0, "merged")
+    return MergeResult(elements, lineage, network.observations.left_out, aliases, report)
+
+
+def _merge_shapes(
+    observations: Observations, sets: ElementSets, options: Options, progress: Progress
+) -> tuple[NDArray[np.object_], int]:
+    """Merge each component into one shape; return them, and for how many areas the threshold was lowered."""
+    table = observations.table
+    shapes = table["shape"].to_numpy()
+    merged = shapes[sets.base]
+    is_area = table["is_area"].to_numpy()[sets.base]
+    several = np.diff(sets.bounds) > 1
+    total = max(1, int(shapely.get_num_coordinates(shapes).sum()))
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        progress(0.4 + 0.55 * min(1.0, done / total), "merging")
+
+    lines = np.flatnonzero(several & ~is_area)
+    merged[lines] = _merge_lines(shapes, sets, lines, advance)
+    lowered = 0
+    for number in np.flatnonzero(several & is_area).tolist():
+        members = shapes[sets.order[sets.bounds[number] : sets.bounds[number + 1]]]
+        result = merge_areas(members, coverage=options.coverage)
+        merged[number] = result.polygon
+        lowered += result.lowered
+        advance(int(shapely.get_num_coordinates(members).sum()))
+    return merged, lowered
+
+
+def _merge_lines(
+    shapes: NDArray[np.object_], sets: ElementSets, chosen: NDArray[np.intp], advance: Callable[[int], object]
+) -> NDArray[np.object_]:
+    """Merge the lines of the chosen components."""
+    if len(chosen) == 0:
+        return np.empty(0, dtype=object)
+    size = np.diff(sets.bounds)[chosen]
+    # Positions in `order` of all members of the chosen components, one after the other.
+    ends = np.cumsum(size)
+    members = sets.order[np.repeat(sets.bounds[chosen] - (ends - size), size) + np.arange(ends[-1])]
+    counts = shapely.get_num_coordinates(shapes[members])
+    first = ends - size
+    bounds = np.append(0, np.cumsum(counts))[np.append(first, ends[-1])]
+    flat = PolylineSets(shapely.get_coordinates(shapes[members]), bounds, counts[first].astype(np.intp))
+    result = merge_sets(flat, advance=advance)
+    owner = np.repeat(np.arange(len(result)), [len(line) for line in result])
+    lines: NDArray[np.object_] = shapely.linestrings(np.concatenate(result), indices=owner)
+    return lines
+
+
+def _report(
+    observations: Observations, sets: ElementSets, elements: gpd.GeoDataFrame, options: Options, *, lowered: int
+) -> dict[str, Any]:
+    table, left_out = observations.table, observations.left_out
+    local = table[~table["is_main"]]
+    classes = {
+        str(name): {
+            "observations": len(rows),
+            "observed_m": round(float(rows["length_m"].sum()), 3),
+            "elements": int((elements["class"] == name).sum()),
+            "elements_m": round(float(elements.loc[elements["class"] == name, "length_m"].sum()), 3),
+        }
+        for name, rows in table.groupby("class", sort=True)
+    }
+    warnings = list(observations.notes["warnings"])
+    if lowered:
+        warnings.append(
+            f"{lowered} areas have no place that {options.coverage:.0%} of their observations cover; "
+            "their highest coverage was used instead"
+        )
+    sizes = np.diff(sets.bounds)
+    return {
+        "method": options.method,
+        "proximity_m": options.proximity,
+        "coverage": options.coverage,
+        "min_score": options.min_score,
+        "working_crs": crs_name(observations.crs),
+        "out_crs": crs_name(observations.out_crs),
+        "instance_from": observations.notes["instance_from"],
+        "observations": len(local),
+        "main_map_elements": len(table) - len(local),
+        "instances": int(local["group"].nunique()),
+        "elements": len(elements),
+        "largest_set": int(sizes.max()) if len(sizes) else 0,
+        "left_out": {str(reason): int(count) for reason, count in left_out["reason"].value_counts(sort=False).items()},
+        "cleaned_vertices": observations.notes["cleaned_vertices"],
+        "areas_with_lowered_coverage": lowered,
+        "classes": classes,
+        "warnings": warnings,
+    }

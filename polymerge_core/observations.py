@@ -1,0 +1,318 @@
+"""From layers as users have them to one table of observations in metres, in canonical order.
+
+Every feature of every layer becomes one observation or more (a multi-part feature has one for each part), or
+is left out with a reason. Rows come out sorted by content (`polymerge_core.ordering`), never by their place
+in a file, so that whatever reads the table from top to bottom gives the same result for the same data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from polymerge_core.columns import Layer, read_columns
+from polymerge_core.crs import check_coordinates, is_local, parse_crs, transform_coordinates, working_crs
+from polymerge_core.errors import CrsError, InputError
+from polymerge_core.options import Options
+from polymerge_core.ordering import canonical_order
+from polymerge_core.schema import LEFT_OUT_COLUMNS, LINE_CLASSES, LocalMaps
+
+#: Vertices nearer than this to the one before (metres) are the same vertex: no map is finer.
+MIN_SEGMENT_M = 1e-9
+
+#: Beyond this (metres) a floating-point number no longer tells a tenth of a millimetre.
+MAX_COORDINATE = 1e12
+
+_POLYGON, _LINES = 3, (1, 2)
+_FIRST_MULTI = 4
+
+
+@dataclass(frozen=True)
+class Observations:
+    """All observations of a merge, in metres and in canonical order.
+
+    Parameters
+    ----------
+    table : DataFrame
+        One row an observation, main map first. `shape` is a LineString or, for an area, a Polygon, in the working
+        CRS; `original` is the same in the layer's own CRS. `as_polygon` tells in which of the two types an area
+        came. `from_m` and `to_m` are the interval of the source feature that the observation is.
+    attributes : DataFrame
+        The user's columns, row by row.
+    left_out : DataFrame
+        What is in no observation, with reasons.
+    crs, out_crs : pyproj.CRS
+        Where the work happens, and the CRS of the output.
+    layer_crs : list of pyproj.CRS
+        CRS of each layer, by the number in ``table["layer"]``.
+    notes : dict
+        What the report says about reading: instance rule, counts of what was cleaned, warnings.
+    """
+
+    table: pd.DataFrame
+    attributes: pd.DataFrame
+    left_out: pd.DataFrame
+    crs: pyproj.CRS
+    out_crs: pyproj.CRS
+    layer_crs: list[pyproj.CRS]
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def lines(self) -> NDArray[np.object_]:
+        """Each observation as a line: itself, or an area's outer ring."""
+        return as_lines(self.table["shape"].to_numpy())
+
+
+def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], options: Options) -> Observations:
+    """Read layers into one table of observations.
+
+    Parameters
+    ----------
+    local_maps : sequence of LocalMaps
+        The layers to merge.
+    main_map : sequence of LocalMaps
+        The layers of the map to merge them into, if any.
+    options : Options
+        Columns, classes and CRS.
+
+    Returns
+    -------
+    Observations
+        In canonical order.
+
+    Raises
+    ------
+    SchemaError, CrsError
+        If a layer as a whole cannot be used.
+    InputError
+        With ``strict``, if any feature is left out.
+    """
+    layers = [Layer(maps, is_main=True) for maps in main_map] + [Layer(maps, is_main=False) for maps in local_maps]
+    if not layers:
+        raise InputError("there are no layers to merge")
+    features, attributes, notes = read_columns(layers, options)
+    parts = _explode(features)
+    parts = _resolve_kinds(parts, options)
+    layer_crs, reference, work = _choose_crs(layers, parts, options)
+    out_crs = reference if options.out_crs is None else parse_crs(options.out_crs)
+    if is_local(out_crs) != is_local(work):
+        raise CrsError("out_crs cannot be used: plain metric coordinates (crs=local) have no place on Earth")
+    parts = _to_working_crs(parts, layer_crs, work)
+    _check_shapes(parts)
+    _measure(parts)
+    table, duplicates = canonical_order(parts[parts["reason"].isna()], attributes)
+    left_out = _left_out(pd.concat([parts[parts["reason"].notna()], duplicates]), list(local_maps))
+    if options.strict and len(left_out):
+        first = left_out.iloc[0]
+        raise InputError(
+            f"{first['source']}: feature {first['source_fid']} cannot be used: {first['reason']} "
+            f"({len(left_out)} in all); mend the layer, or run without strict to leave such features out"
+        )
+    notes["cleaned_vertices"] = int(parts["cleaned"].sum())
+    attributes = attributes.iloc[table["feature"]].reset_index(drop=True)
+    return Observations(table, attributes, left_out, work, out_crs, layer_crs, notes)
+
+
+def as_lines(shapes: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Return LineStrings as they are and Polygons as their outer ring."""
+    lines = shapes.copy()
+    areas = shapely.get_type_id(shapes) == _POLYGON
+    lines[areas] = _ring_to_line(shapely.get_exterior_ring(shapes[areas]))
+    return lines
+
+
+def _explode(features: pd.DataFrame) -> pd.DataFrame:
+    """Return one row a part, in two dimensions; what is no line or polygon gets a reason."""
+    features = features.assign(feature=np.arange(len(features)))
+    shapes = features["shape"].to_numpy()
+    reason = features["reason"].to_numpy(dtype=object, copy=True)
+    _give(reason, shapely.is_missing(shapes), "no geometry")
+    _give(reason, shapely.is_empty(shapes), "empty geometry")
+    coordinates, owner = shapely.get_coordinates(shapes, return_index=True)
+    _give(reason, _any_of(owner[~np.isfinite(coordinates).all(axis=1)], len(shapes)), "a coordinate is not a number")
+    _give(
+        reason,
+        _any_of(owner[(np.abs(coordinates) > MAX_COORDINATE).any(axis=1)], len(shapes)),
+        "a coordinate is too large",
+    )
+    features["reason"] = reason
+    usable = np.flatnonzero(pd.isna(reason))
+    geometry, row = shapely.force_2d(shapes[usable]), usable
+    while (shapely.get_type_id(geometry) >= _FIRST_MULTI).any():
+        geometry, part = shapely.get_parts(geometry, return_index=True)
+        row = row[part]
+    left = np.flatnonzero(pd.notna(reason))
+    parts = features.iloc[np.concatenate([row, left])].copy()
+    parts["shape"] = np.concatenate([geometry, np.full(len(left), None)])
+    parts = parts.iloc[np.argsort(parts["feature"], kind="stable")].reset_index(drop=True)
+    kind = shapely.get_type_id(parts["shape"].to_numpy())
+    _exclude(parts, ~np.isin(kind, (*_LINES, _POLYGON, -1)), "neither a line nor a polygon")
+    return parts
+
+
+def _resolve_kinds(parts: pd.DataFrame, options: Options) -> pd.DataFrame:
+    """Decide what is an area: declared by the class, else by the geometry (never guessed from the data)."""
+    polygon = shapely.get_type_id(parts["shape"].to_numpy()) == _POLYGON
+    declared_line = parts["class"].isin(LINE_CLASSES - options.area).to_numpy()
+    parts["is_area"] = parts["class"].isin(options.area).to_numpy() | (polygon & ~declared_line)
+    parts["as_polygon"] = polygon & parts["is_area"].to_numpy()
+    parts = _polygons_to_rings(parts, polygon & declared_line)
+    _lines_to_polygons(parts)
+    return parts
+
+
+def _polygons_to_rings(parts: pd.DataFrame, chosen: NDArray[np.bool_]) -> pd.DataFrame:
+    """Replace polygons of a line class by their rings, each a closed line."""
+    if not chosen.any():
+        return parts
+    rows = np.flatnonzero(chosen)
+    rings, owner = shapely.get_rings(parts["shape"].to_numpy()[rows], return_index=True)
+    exploded = parts.iloc[rows[owner]].assign(shape=_ring_to_line(rings))
+    parts = pd.concat([parts[~chosen], exploded])
+    return parts.iloc[np.argsort(parts["feature"], kind="stable")].reset_index(drop=True)
+
+
+def _lines_to_polygons(parts: pd.DataFrame) -> None:
+    """Close the lines of area classes, in place; two vertices enclose nothing."""
+    rows = np.flatnonzero(parts["is_area"] & ~parts["as_polygon"] & parts["reason"].isna())
+    lines = shapely.remove_repeated_points(parts["shape"].to_numpy()[rows], 0.0)
+    distinct = shapely.get_num_coordinates(lines) - shapely.is_closed(lines)
+    _exclude(parts, _any_of(rows[distinct < 3], len(parts)), "an open line of two vertices encloses no area")
+    rows, lines = rows[distinct >= 3], lines[distinct >= 3]
+    coordinates, owner = shapely.get_coordinates(lines, return_index=True)
+    shapes = parts["shape"].to_numpy(copy=True)
+    if len(rows):
+        shapes[rows] = shapely.polygons(shapely.linearrings(coordinates, indices=owner))
+    parts["shape"] = shapes
+
+
+def _choose_crs(
+    layers: list[Layer], parts: pd.DataFrame, options: Options
+) -> tuple[list[pyproj.CRS], pyproj.CRS, pyproj.CRS]:
+    """Return the CRS of every layer, the reference one (main map's, else first) and the working one."""
+    declared = None if options.crs is None else parse_crs(options.crs)
+    usable = parts[parts["reason"].isna()]
+    bounds = {
+        int(number): tuple(shapely.total_bounds(group["shape"].to_numpy())) for number, group in usable.groupby("layer")
+    }
+    found = [_layer_crs(layer, declared, needed=number in bounds) for number, layer in enumerate(layers)]
+    reference = next((crs for crs in found if crs is not None), declared)
+    if reference is None:
+        raise CrsError(_no_crs(layers[0].where))
+    layer_crs = [reference if crs is None else crs for crs in found]
+    if len({is_local(layer_crs[number]) for number in bounds}) > 1:
+        raise CrsError(
+            "plain metric coordinates (crs=local) cannot be brought together with data that has a CRS; "
+            "declare the CRS of every layer, or crs=local for all of them"
+        )
+    for number, box in bounds.items():
+        check_coordinates(layer_crs[number], box, layers[number].where)
+    if not bounds or is_local(reference):
+        return layer_crs, reference, reference
+    boxes = np.array(
+        [
+            pyproj.Transformer.from_crs(layer_crs[number], reference, always_xy=True).transform_bounds(*box)
+            for number, box in bounds.items()
+        ]
+    )
+    if not np.isfinite(boxes).all():
+        raise CrsError(f"the layers lie so far apart that they cannot be brought together in {reference.name}")
+    union = (*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist())
+    return layer_crs, reference, working_crs(reference, union)
+
+
+def _layer_crs(layer: Layer, declared: pyproj.CRS | None, *, needed: bool) -> pyproj.CRS | None:
+    crs = layer.data.crs
+    if crs is not None:
+        return parse_crs(crs)
+    if declared is None and needed:
+        raise CrsError(_no_crs(layer.where))
+    return declared
+
+
+def _no_crs(where: str) -> str:
+    return (
+        f"{where}: the layer has no coordinate reference system; declare it with crs (such as EPSG:32632), "
+        "or crs=local for plain metric coordinates"
+    )
+
+
+def _to_working_crs(parts: pd.DataFrame, layer_crs: list[pyproj.CRS], work: pyproj.CRS) -> pd.DataFrame:
+    """Reproject and clean; the shape in the layer's own CRS stays in the column `original`."""
+    shapes = parts["shape"].to_numpy()
+    before = shapely.get_num_coordinates(shapes)
+    original = shapely.remove_repeated_points(shapes, 0.0)
+    moved = original.copy()
+    for number, rows in parts[parts["reason"].isna()].groupby("layer").indices.items():
+        index = np.flatnonzero(parts["reason"].isna())[rows]
+        source = layer_crs[int(number)]
+        if source != work:
+            moved[index] = shapely.transform(
+                moved[index], lambda xy, source=source: transform_coordinates(xy, source, work)
+            )
+    moved = shapely.remove_repeated_points(moved, MIN_SEGMENT_M)
+    cleaned = before - shapely.get_num_coordinates(moved)
+    return parts.assign(shape=moved, original=original, cleaned=np.maximum(cleaned, 0))
+
+
+def _check_shapes(parts: pd.DataFrame) -> None:
+    """Give a reason to what has no length and to rings that cross themselves, in place."""
+    usable = np.flatnonzero(parts["reason"].isna())
+    shapes = parts["shape"].to_numpy()[usable]
+    _exclude(parts, _any_of(usable[shapely.length(shapes) < MIN_SEGMENT_M], len(parts)), "zero length")
+    areas = usable[shapely.get_type_id(shapes) == _POLYGON]
+    crossed = areas[~shapely.is_valid(parts["shape"].to_numpy()[areas])]
+    _exclude(parts, _any_of(crossed, len(parts)), "the ring of an area touches or crosses itself")
+
+
+def _measure(parts: pd.DataFrame) -> None:
+    """Add `from_m` and `to_m`: the parts of a feature follow each other along its length, in place."""
+    length = shapely.length(parts["shape"].to_numpy())
+    parts["length_m"] = np.where(np.isfinite(length), length, 0.0)
+    parts["to_m"] = parts.groupby("feature")["length_m"].cumsum()
+    parts["from_m"] = parts["to_m"] - parts["length_m"]
+
+
+def _left_out(parts: pd.DataFrame, local_maps: list[LocalMaps]) -> pd.DataFrame:
+    """List what was left out here and before, in canonical order."""
+    earlier = [maps.left_out for maps in local_maps if maps.left_out is not None and len(maps.left_out)]
+    listed = pd.concat([parts[list(LEFT_OUT_COLUMNS)], *(table[list(LEFT_OUT_COLUMNS)] for table in earlier)])
+    listed["instance"] = listed["instance"].astype(str)
+    keys = ["source", "drive", "instance", "reason", "from_m", "to_m", "source_fid"]
+    text = listed["source_fid"].astype(str)
+    return (
+        listed.assign(_fid=text.str.zfill(20))
+        .sort_values([*keys[:-1], "_fid"])
+        .drop(columns="_fid")
+        .reset_index(drop=True)
+    )
+
+
+def _ring_to_line(rings: NDArray[np.object_]) -> NDArray[np.object_]:
+    coordinates, owner = shapely.get_coordinates(rings, return_index=True)
+    lines: NDArray[np.object_] = shapely.linestrings(coordinates, indices=owner) if len(rings) else rings
+    return lines
+
+
+def _any_of(rows: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
+    chosen = np.zeros(count, dtype=bool)
+    chosen[rows] = True
+    return chosen
+
+
+def _give(reason: NDArray[np.object_], chosen: NDArray[np.bool_], text: str) -> None:
+    """Give a reason to the chosen that have none yet, in place."""
+    reason[chosen & pd.isna(reason)] = text
+
+
+def _exclude(parts: pd.DataFrame, chosen: NDArray[np.bool_], text: str) -> None:
+    reason = parts["reason"].to_numpy(dtype=object, copy=True)
+    _give(reason, np.asarray(chosen), text)
+    parts["reason"] = reason

@@ -1,0 +1,131 @@
+"""The canonical order of instances and observations, and duplicates.
+
+Nothing may depend on where a feature stands in a file. Instances are ordered by the first timestamp of their
+drive, drive, timestamp and instance; those without names of their own (a whole layer, a single feature) by
+their content. Observations of one instance are ordered by their normalised WKB.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+_DIGITS = re.compile(r"(\d+)")
+
+
+def canonical_order(parts: pd.DataFrame, attributes: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Sort observations by content and find the ones that occur twice.
+
+    Parameters
+    ----------
+    parts : DataFrame
+        Usable observations with the columns of `polymerge_core.observations.Observations.table`.
+    attributes : DataFrame
+        The user's columns, by the number in ``parts["feature"]``: the last resort where all else is equal.
+
+    Returns
+    -------
+    table : DataFrame
+        The observations, main map first, with the columns `group` (0, 1, ... for the local maps in order, -1 for
+        the main map) and `key` (rank of the normalised WKB) added; the index is the canonical position.
+    duplicates : DataFrame
+        Observations that repeat class and geometry of another one of the same local map, with a reason.
+    """
+    shapes = parts["shape"].to_numpy()
+    normalised = shapely.to_wkb(shapely.normalize(shapes))
+    # The normalised form forgets the direction of digitisation, the raw one settles equal forms.
+    _, key = np.unique(normalised, return_inverse=True)
+    _, exact = np.unique(shapely.to_wkb(shapes), return_inverse=True)
+    parts = parts.assign(key=key, exact=exact)
+    parts["rank"] = _instance_rank(parts, normalised)
+    parts["tie"] = _tie_break(parts, attributes)
+    columns = ["rank", "key", "class", "exact", "tie", "from_m"]
+    parts = parts.sort_values(columns, kind="stable").reset_index(drop=True)
+    twice = parts.duplicated(["is_main", "drive", "instance", "class", "key"]) & ~parts["is_main"]
+    duplicates = parts[twice].assign(reason="duplicate")
+    table = parts[~twice].reset_index(drop=True)
+    table["group"] = _group_in_order(table)
+    return table.drop(columns=["rank", "exact", "tie"]), duplicates
+
+
+def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
+    """Return a sort key that puts ``frame 9`` before ``frame 10``.
+
+    Examples
+    --------
+    >>> sorted(["b2", "b10", "a3"], key=natural_key)
+    ['a3', 'b2', 'b10']
+    """
+    pieces = [piece for piece in _DIGITS.split(text) if piece]
+    # The text itself comes last, so that "01" and "1" differ.
+    return (*((0, int(piece), "") if piece.isdecimal() else (1, 0, piece) for piece in pieces), (2, 0, text))
+
+
+def _instance_rank(parts: pd.DataFrame, normalised: NDArray[np.object_]) -> NDArray[np.intp]:
+    """Rank the local maps; equal content without a name has equal rank, the main map rank -1."""
+    group = parts.groupby(["is_main", "instance_kind", "drive", "instance"], sort=False).ngroup().to_numpy()
+    drive_start = parts.groupby("drive")["timestamp_ns"].transform("min").to_numpy()
+    first = pd.DataFrame(
+        {
+            "drive_start": drive_start,
+            "kind": parts["instance_kind"],
+            "drive": parts["drive"],
+            "time": parts["timestamp_ns"],
+            "instance": parts["instance"],
+            "is_main": parts["is_main"],
+        }
+    )
+    instances = first.groupby(group).agg(
+        {
+            "drive_start": "first",
+            "kind": "first",
+            "drive": "first",
+            "time": "min",
+            "instance": "first",
+            "is_main": "first",
+        }
+    )
+    content = _contents(group, parts["key"].to_numpy(), normalised)
+    keys: list[tuple[Any, ...]] = []
+    for row, own in zip(instances.itertuples(index=False), content, strict=True):
+        named = row.kind == "column"
+        drive = natural_key(row.drive) if named else ()
+        instance: Hashable = natural_key(row.instance) if named else own
+        keys.append((not row.is_main, row.drive_start, not named, drive, row.time, instance))
+    ranks = {key: rank for rank, key in enumerate(sorted(set(keys)))}
+    rank = np.array([ranks[key] for key in keys], dtype=np.intp)
+    return rank[group] if len(rank) else np.empty(0, np.intp)
+
+
+def _contents(
+    group: NDArray[np.intp], key: NDArray[np.intp], normalised: NDArray[np.object_]
+) -> list[tuple[bytes, ...]]:
+    """Return for each local map the normalised WKB of its observations, sorted."""
+    order = np.lexsort((key, group))
+    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+    return [tuple(part) for part in np.split(normalised[order], starts[1:])] if len(group) else []
+
+
+def _tie_break(parts: pd.DataFrame, attributes: pd.DataFrame) -> NDArray[np.object_]:
+    """Return a text that tells apart observations whose geometry and local map are the same."""
+    tie = np.full(len(parts), "", dtype=object)
+    same = parts.duplicated(["rank", "class", "exact"], keep=False).to_numpy()
+    values = attributes.iloc[parts.loc[same, "feature"]].itertuples(index=False, name=None)
+    scores = parts.loc[same, "score"]
+    tie[same] = [repr((score, *map(str, row))) for score, row in zip(scores.tolist(), values, strict=True)]
+    return tie
+
+
+def _group_in_order(table: pd.DataFrame) -> NDArray[np.intp]:
+    """Give each local map the number of its first observation, -1 to the main map."""
+    local = table[~table["is_main"]]
+    codes = local.groupby(["drive", "instance", "instance_kind"], sort=False).ngroup()
+    group = np.full(len(table), -1, dtype=np.intp)
+    group[codes.index] = codes.to_numpy()
+    return group
