@@ -55,7 +55,11 @@ def cut(points: Array, ends_m: Array, gap_at: float | None) -> list[Array]:
     if gap_at is not None:
         middle = start + gap_at * (stop - start)
         limits = [(start, middle - _SPLIT_GAP_M / 2), (middle + _SPLIT_GAP_M / 2, stop)]
-    return [points[(arc >= low) & (arc <= high)] for low, high in limits]
+    return [
+        points_at(points, arc, np.concatenate([[low], arc[(arc > low) & (arc < high)], [high]]))
+        for low, high in limits
+        if low < high
+    ]
 
 
 def longest_inside(points: Array) -> Array:

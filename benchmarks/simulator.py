@@ -61,9 +61,7 @@ class SimulatedDrive:
     poses: pd.DataFrame
 
 
-def key_frames(
-    poses: pd.DataFrame, count: int = 15, spacing: float = 3.5, *, start: float = 0.0
-) -> pd.DataFrame:
+def key_frames(poses: pd.DataFrame, count: int = 15, spacing: float = 3.5, *, start: float = 0.0) -> pd.DataFrame:
     """Choose frames at even distances along a drive.
 
     Parameters
@@ -174,11 +172,7 @@ def _true_elements(truth: gpd.GeoDataFrame) -> list[_TrueElement]:
         raise SchemaError(f"the truth has no column class, only {', '.join(truth.columns)}")
     labels = pd.Index(CLASS_NAMES).get_indexer(truth["class"])
     lines = truth.geometry.to_numpy()
-    wrong = (
-        (labels < 0)
-        | (shapely.get_type_id(lines) != shapely.GeometryType.LINESTRING)
-        | shapely.is_empty(lines)
-    )
+    wrong = (labels < 0) | (shapely.get_type_id(lines) != shapely.GeometryType.LINESTRING) | shapely.is_empty(lines)
     if wrong.any():
         row = truth.iloc[int(np.argmax(wrong))]
         raise SchemaError(
@@ -251,9 +245,7 @@ def _local_map(
     }
 
 
-def _look_at_line(
-    points: Array, element: _TrueElement, row: int, noise: Noise, dice: Dice
-) -> Iterator[Array]:
+def _look_at_line(points: Array, element: _TrueElement, row: int, noise: Noise, dice: Dice) -> Iterator[Array]:
     """Yield what is predicted for the stretches of a line that the box holds."""
     stretches = stretches_inside(points, closed=element.closed)
     if not stretches:
@@ -296,9 +288,7 @@ def _line_error(points: Array, element: _TrueElement, row: int, noise: Noise, di
     return np.asarray(lateral[:, None] * normal + noise.along * along[:, None] * tangent)
 
 
-def _look_at_crossing(
-    points: Array, _element: _TrueElement, row: int, noise: Noise, dice: Dice
-) -> Iterator[Array]:
+def _look_at_crossing(points: Array, _element: _TrueElement, row: int, noise: Noise, dice: Dice) -> Iterator[Array]:
     """Yield what is predicted for a crossing, cut by the box."""
     corners = points[:-1]
     if dice.rng(Part.MISSED, row).random() < noise.missed:

@@ -90,9 +90,7 @@ def town_drive() -> pd.DataFrame:
     at = np.arange(0.0, arc[-1], 0.1)
     x, y = (np.interp(at, arc, axis) for axis in path.T)
     # A vehicle does not follow the corners of a polyline: its course is that over 2 m of way.
-    ahead, behind = (
-        np.column_stack([np.interp(at + step, arc, axis) for axis in path.T]) for step in (1.0, -1.0)
-    )
+    ahead, behind = (np.column_stack([np.interp(at + step, arc, axis) for axis in path.T]) for step in (1.0, -1.0))
     half = np.arctan2(*(ahead - behind).T[::-1]) / 2
     zero = np.zeros_like(at)
     poses: pd.DataFrame = pd.DataFrame(
@@ -130,9 +128,7 @@ def _kerbs() -> list[Array]:
     along = np.arange(_ARM_M, -0.1, -1.0)
     neighbours = zip(_ARMS, (*_ARMS[1:], _ARMS[0]), strict=True)
     return [
-        _thinned(
-            _joined(arm.at(along, arm.half_width), after.at(along[::-1], -after.half_width), _CORNER_RADIUS_M)
-        )
+        _thinned(_joined(arm.at(along, arm.half_width), after.at(along[::-1], -after.half_width), _CORNER_RADIUS_M))
         for arm, after in neighbours
     ]
 

@@ -1,7 +1,6 @@
 """Merge many overlapping, imperfect digitisations of the same lines into one clean map."""
 
 from polymerge_core.errors import CrsError, InputError, OptionError, OutputError, PolymergeError, SchemaError
-from polymerge_core.figures import before_after
 from polymerge_core.formats import read_poses, read_predictions
 from polymerge_core.frames import project
 from polymerge_core.graph import merge_network, network_layers
@@ -20,7 +19,6 @@ __all__ = [
     "OutputError",
     "PolymergeError",
     "SchemaError",
-    "before_after",
     "merge",
     "merge_network",
     "network_layers",

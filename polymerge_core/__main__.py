@@ -14,7 +14,7 @@ import geopandas as gpd
 import numpy as np
 
 import polymerge_core as pm
-from polymerge_core import console, demo
+from polymerge_core import console
 from polymerge_core.environment import library_versions
 from polymerge_core.formats import read_matrix
 from polymerge_core.io import layer_targets, split_source, stage_layers
@@ -184,6 +184,8 @@ def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **c
 @click.option("--overwrite", is_flag=True, help="Replace the outputs of an earlier run.")
 def run_demo(folder: Path, *, overwrite: bool) -> None:
     """Merge the sample, a simulated drive through a town junction, into FOLDER and draw it."""
+    from polymerge_core import demo  # noqa: PLC0415 - matplotlib is slow to load, and only this command draws
+
     click.echo(demo.run_demo(folder, overwrite=overwrite))
 
 

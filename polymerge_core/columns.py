@@ -73,6 +73,8 @@ def read_columns(layers: Sequence[Layer], options: Options) -> tuple[pd.DataFram
     features, attributes = [], []
     for number, layer in enumerate(layers):
         _check_layer(layer)
+        if layer.data.empty:
+            notes["warnings"].append(f"{layer.where} holds no features")
         table, used = _features(layer, options, several=count > 1, notes=notes)
         features.append(table.assign(layer=number))
         attributes.append(_user_columns(layer, used))
@@ -130,11 +132,12 @@ class _Finder:
         # The main map has the contract's own columns, whatever the local maps call theirs.
         named = name is not None and not self.layer.is_main
         columns = [column for column in data.columns if column != data.active_geometry_name]
-        found = find_column(columns, name if named and name else default, named=named, where=self.layer.where)
+        wanted = default if name is None or not named else name
+        found = find_column(columns, wanted, named=named, where=self.layer.where)
         if found is None:
             return None
         self.used.add(found)
-        return pd.Series(data[found].to_numpy(), dtype=data[found].dtype)
+        return pd.Series(data[found].to_numpy(), dtype=data[found].dtype, name=found)
 
 
 def _read_class(find: _Finder, options: Options, table: pd.DataFrame) -> pd.Series:
@@ -193,22 +196,36 @@ def _read_timestamp(column: pd.Series | None, where: str) -> NDArray[np.int64] |
     """Return integer nanoseconds, `NO_TIMESTAMP` where there is none."""
     if column is None:
         return NO_TIMESTAMP
-    missing = column.isna()
-    if pd.api.types.is_bool_dtype(column):
-        raise SchemaError(f"{where}: the column {column.name!r} of timestamps holds true and false")
-    if pd.api.types.is_integer_dtype(column):
-        return column.astype("Int64").fillna(NO_TIMESTAMP).to_numpy(dtype=np.int64)
-    if pd.api.types.is_float_dtype(column):
-        return np.where(missing, NO_TIMESTAMP, column.fillna(0).to_numpy()).astype(np.int64)
-    times = pd.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
-    unread = times.isna() & ~missing
-    if unread.any():
-        raise SchemaError(
-            f"{where}: {column[unread].iloc[0]!r} is not a timestamp; timestamps are dates with times, or integer "
-            "nanoseconds (name another column with timestamp_field)"
-        )
-    nanoseconds = times.dt.tz_localize(None).to_numpy(dtype="datetime64[ns]").astype(np.int64)
-    return np.where(missing, NO_TIMESTAMP, nanoseconds)
+    there = column.notna().to_numpy()
+    nanoseconds = np.full(len(column), NO_TIMESTAMP, dtype=np.int64)
+    nanoseconds[there] = _nanoseconds(column[there], where)
+    return nanoseconds
+
+
+def _nanoseconds(held: pd.Series, where: str) -> NDArray[np.int64]:
+    """Read dates with times, or whole numbers (as text too: Shapefile has no numbers of 19 digits)."""
+    if not pd.api.types.is_numeric_dtype(held):
+        times = pd.to_datetime(held, utc=True, errors="coerce", format="ISO8601")
+        # Beyond the years 1677 to 2262 nanoseconds would silently begin again.
+        fits = times.between(pd.Timestamp.min.tz_localize("UTC"), pd.Timestamp.max.tz_localize("UTC"))
+        if fits.all():
+            return times.dt.tz_localize(None).to_numpy(dtype="datetime64[ns]").astype(np.int64)
+        text = held.map(str)
+        if not text.str.fullmatch(r"\d{1,19}").all():
+            raise _not_a_timestamp(held[~fits], where)
+        held = pd.to_numeric(text)
+    numbers = held.to_numpy(dtype=float)
+    whole = (np.abs(numbers) < NO_TIMESTAMP) & (np.floor(numbers) == numbers)
+    if pd.api.types.is_bool_dtype(held) or not whole.all():
+        raise _not_a_timestamp(held if whole.all() else held[~whole], where)
+    return held.astype(np.int64).to_numpy()
+
+
+def _not_a_timestamp(unfit: pd.Series, where: str) -> SchemaError:
+    return SchemaError(
+        f"{where}, column {unfit.name}: {unfit.iloc[0]!s} is not a timestamp; timestamps are dates with times, or "
+        "integer nanoseconds (name another column with timestamp_field)"
+    )
 
 
 def _read_main(find: _Finder, layer: Layer, table: pd.DataFrame) -> None:

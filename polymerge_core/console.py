@@ -9,6 +9,7 @@ from __future__ import annotations
 import _thread
 import json
 import os
+import signal
 import sys
 import threading
 import warnings
@@ -26,6 +27,9 @@ ProgressMode = Literal["auto", "json", "none"]
 DONE, BAD_DATA, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
 _STEPS = 1000
+
+#: What libraries say to programmers; a user of the command line can do nothing about it.
+_LIBRARY_NEWS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning, ResourceWarning)
 
 
 class ProgressReport:
@@ -84,6 +88,9 @@ def progress_report(mode: ProgressMode) -> Iterator[ProgressReport]:
 
 def watch_stdin() -> None:
     """Interrupt the run, as Ctrl-C does, as soon as standard input closes."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        # Whoever is started in the background by a shell ignores Ctrl-C, and an interrupt would do nothing.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def wait() -> None:
         try:
@@ -114,6 +121,8 @@ def run(command: click.Command, arguments: list[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("default")
+            for category in _LIBRARY_NEWS:
+                warnings.simplefilter("ignore", category)
             warnings.showwarning = lambda message, *_args, **_kwargs: say(f"warning: {message}")
             command.main(arguments, prog_name="polymerge", standalone_mode=False)
             sys.stdout.flush()
@@ -133,7 +142,7 @@ def run(command: click.Command, arguments: list[str] | None = None) -> int:
 def _explain(error: BaseException) -> tuple[str, int | None]:
     """Return what to tell the user about an error, and the exit code; None where the traceback is wanted."""
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
-        return "interrupted; nothing was written", INTERRUPTED
+        return "interrupted; nothing half-written was left behind", INTERRUPTED
     if isinstance(error, click.ClickException):
         usage = isinstance(error, click.UsageError)
         hint = " (--help shows the options)" if usage else ""

@@ -173,15 +173,16 @@ def check_coordinates(crs: pyproj.CRS, bounds: Bounds, where: str) -> None:
         return
     xmin, ymin, xmax, ymax = bounds
     like_degrees = crs.is_projected and max(abs(xmin), abs(xmax)) <= 180 and max(abs(ymin), abs(ymax)) <= 90
-    if like_degrees and area.east - area.west > 180:
-        raise CrsError(
-            f"{where}: coordinates from ({xmin:g}, {ymin:g}) to ({xmax:g}, {ymax:g}) look like degrees, but the "
-            f"layer claims {crs.name}, which is in metres; {hint}"
-        )
     margin = 0.0 if like_degrees else AREA_OF_USE_MARGIN_DEG
     inside_lon = (lon.min() >= area.west - margin) & (lon.max() <= area.east + margin)
     inside_lat = (lat.min() >= area.south - margin) & (lat.max() <= area.north + margin)
-    if not (inside_lon and inside_lat):
+    outside = not (inside_lon and inside_lat)
+    if like_degrees and (outside or area.east - area.west > 180):
+        raise CrsError(
+            f"{where}: coordinates from ({xmin:g}, {ymin:g}) to ({xmax:g}, {ymax:g}) look like degrees, but the "
+            f"layer claims {crs.name}, which is projected; {hint}"
+        )
+    if outside:
         raise CrsError(
             f"{where}: the coordinates lie near longitude {lon.mean():.2f}, latitude {lat.mean():.2f}, far from "
             f"where {crs.name} is used ({area.name.split('.')[0]}); {hint}"

@@ -120,23 +120,22 @@ def _carry_columns(
     attributes: pd.DataFrame, component: NDArray[np.intp], base: NDArray[np.intp], aggregate: str | Mapping[str, str]
 ) -> pd.DataFrame:
     """Carry the user's columns from observations to elements."""
-    chosen = _chosen_functions(attributes, aggregate)
     carried = attributes.iloc[base].reset_index(drop=True)
-    for name, function in chosen.items():
-        if function == "first":
-            continue
-        groups = attributes[name].groupby(component)
-        values = _mode(attributes[name], component) if function == "mode" else groups.agg(function)
-        carried[name] = values.reindex(range(len(base))).to_numpy()
-    return carried
+    for name, function in _chosen_functions(attributes, aggregate).items():
+        if function != "first":
+            values = _aggregate(attributes[name], component, function)
+            carried[name] = values.reindex(range(len(base))).array
+    # Integers were made nullable to bring layers together; where none is missing they are plain again.
+    whole = [name for name, dtype in carried.dtypes.items() if dtype == "Int64" and not carried[name].hasnans]
+    return carried.astype(dict.fromkeys(whole, np.int64))
 
 
-def _chosen_functions(attributes: pd.DataFrame, aggregate: str | Mapping[str, str]) -> dict[str, str]:
-    numeric = {str(name) for name in attributes.columns if pd.api.types.is_numeric_dtype(attributes[name])}
+def _chosen_functions(attributes: pd.DataFrame, aggregate: str | Mapping[str, str]) -> dict[Any, str]:
+    numeric = {name for name in attributes.columns if pd.api.types.is_numeric_dtype(attributes[name])}
     if isinstance(aggregate, str):
         # One function for all columns: means and sums are for the columns that have them.
         only_numbers = aggregate in ("mean", "sum", "min", "max")
-        return {str(name): aggregate for name in attributes.columns if str(name) in numeric or not only_numbers}
+        return {name: aggregate for name in attributes.columns if name in numeric or not only_numbers}
     for name, function in aggregate.items():
         if name not in attributes.columns:
             known = ", ".join(map(str, attributes.columns)) or "none"
@@ -146,10 +145,28 @@ def _chosen_functions(attributes: pd.DataFrame, aggregate: str | Mapping[str, st
     return dict(aggregate)
 
 
+def _aggregate(values: pd.Series[Any], component: NDArray[np.intp], function: str) -> pd.Series[Any]:
+    """Return one value for each component that has any."""
+    if function == "mode":
+        return _mode(values, component)
+    groups = values.groupby(component)
+    if function == "sum":
+        return groups.sum(min_count=1)  # the sum of nothing is not 0
+    try:
+        return groups.agg(function)
+    except TypeError as error:
+        raise OptionError(
+            f"aggregate cannot take the {function} of {values.name!r}: some of its values cannot be compared"
+        ) from error
+
+
 def _mode(values: pd.Series[Any], component: NDArray[np.intp]) -> pd.Series[Any]:
     """Return the most frequent value of each component, the smallest where several are as frequent."""
-    counted = values.groupby([component, values]).size().rename("count").reset_index(names=["component", "value"])
-    counted = counted.sort_values(["component", "count", "value"], ascending=[True, False, True])
+    # Lists and dictionaries can be neither counted nor sorted; their text can.
+    key = values if pd.api.types.is_numeric_dtype(values) else values.map(str)
+    counted = pd.DataFrame({"component": component, "key": key, "value": values})[values.notna()]
+    counted["count"] = counted.groupby(["component", "key"])["key"].transform("size")
+    counted = counted.sort_values(["component", "count", "key"], ascending=[True, False, True], kind="stable")
     return counted.drop_duplicates("component").set_index("component")["value"]
 
 

@@ -125,9 +125,7 @@ def _in_metres(frames: list[gpd.GeoDataFrame]) -> tuple[pyproj.CRS | None, list[
     if not any(on_earth):
         return given, frames
     if not all(on_earth):
-        raise CrsError(
-            "some layers of the figure have a CRS and others have none; declare the CRS of every layer"
-        )
+        raise CrsError("some layers of the figure have a CRS and others have none; declare the CRS of every layer")
     filled = [frame for frame in frames if np.isfinite(frame.total_bounds).all()]
     crs = working_crs(given, tuple(filled[0].to_crs(given).total_bounds)) if filled else given
     return crs, [frame.to_crs(crs) for frame in frames]
@@ -136,11 +134,7 @@ def _in_metres(frames: list[gpd.GeoDataFrame]) -> tuple[pyproj.CRS | None, list[
 def _as_lines(frame: gpd.GeoDataFrame) -> _Lines:
     """Take lines, and polygons by their rings, apart into vertices."""
     geometry = frame.geometry.to_numpy()
-    names = (
-        frame["class"].astype(str).to_numpy(object)
-        if "class" in frame
-        else np.full(len(frame), "line", object)
-    )
+    names = frame["class"].astype(str).to_numpy(object) if "class" in frame else np.full(len(frame), "line", object)
     areal = np.isin(shapely.get_type_id(geometry), _AREAL)
     lines = np.where(areal, shapely.boundary(geometry), geometry)
     parts, feature = shapely.get_parts(lines, return_index=True)
@@ -175,10 +169,7 @@ def _view(bounds: Bounds | None, given: Any, crs: pyproj.CRS | None, name: str) 
 def _panels(views: list[Bounds]) -> tuple[Figure, list[list[Axes]]]:
     """Lay out two panels for each view, as high as the views ask for."""
     panel_in = _WIDTH_IN / 2 - 0.9
-    heights = [
-        float(np.clip(panel_in * (ymax - ymin) / (xmax - xmin), 2.0, 12.0))
-        for xmin, ymin, xmax, ymax in views
-    ]
+    heights = [float(np.clip(panel_in * (ymax - ymin) / (xmax - xmin), 2.0, 12.0)) for xmin, ymin, xmax, ymax in views]
     size = (_WIDTH_IN, sum(heights) + 0.8 * len(views) + 0.9)
     figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
     grid = figure.add_gridspec(len(views), 2, height_ratios=heights)
@@ -194,9 +185,7 @@ def _class_colours(*layers: _Lines) -> dict[str, str]:
     return {name: _COLOURS[name] for name in known} | taken
 
 
-def _segments(
-    lines: _Lines, chosen: NDArray[np.bool_], origin: NDArray[np.float64]
-) -> list[NDArray[np.float64]]:
+def _segments(lines: _Lines, chosen: NDArray[np.bool_], origin: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return the vertices of each chosen line, relative to the corner of the picture."""
     keep = chosen[lines.owner]
     starts = np.flatnonzero(np.diff(lines.owner[keep])) + 1
@@ -222,7 +211,7 @@ def _draw_classes(
     close: bool,
 ) -> None:
     width, alpha = (1.6, 0.95) if merged else (0.9, 0.45)
-    width, mark = (1.3 * width, 4.0) if close else (width, 2.6)
+    width, mark = (1.3 * width, 4.2) if close else (width, 3.0)
     for name, colour in colours.items():
         segments = _segments(lines, lines.classes == name, origin)
         drawn = LineCollection(segments, colors=colour, linewidths=width, alpha=alpha, zorder=2)
@@ -252,23 +241,16 @@ def _mark(panels: list[Axes], spot: Bounds, origin: NDArray[np.float64]) -> None
     (xmin, ymin), (xmax, ymax) = np.array(spot).reshape(2, 2) - origin
     for panel in panels:
         size = (xmax - xmin, ymax - ymin)
-        panel.add_patch(
-            Rectangle((xmin, ymin), *size, fill=False, edgecolor="black", linewidth=1.2, zorder=4)
-        )
+        panel.add_patch(Rectangle((xmin, ymin), *size, fill=False, edgecolor="black", linewidth=1.2, zorder=4))
 
 
 def _legend(figure: Figure, colours: dict[str, str], *, with_reference: bool) -> None:
     handles = [
-        Line2D([], [], color=colour, linewidth=2.5, label=name.replace("_", " "))
-        for name, colour in colours.items()
+        Line2D([], [], color=colour, linewidth=2.5, label=name.replace("_", " ")) for name, colour in colours.items()
     ]
     if with_reference:
-        handles.append(
-            Line2D([], [], color=_REFERENCE_COLOUR, linestyle=_REFERENCE_DASHES, label="reference")
-        )
-    handles.append(
-        Line2D([], [], color="black", marker="o", markersize=4, linestyle="none", label="vertex, after")
-    )
+        handles.append(Line2D([], [], color=_REFERENCE_COLOUR, linestyle=_REFERENCE_DASHES, label="reference"))
+    handles.append(Line2D([], [], color="black", marker="o", markersize=4, linestyle="none", label="vertex, after"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=12)
 
 
@@ -286,6 +268,4 @@ def _save(figure: Figure, path: Path) -> None:
         if partial is not None:
             with contextlib.suppress(OSError):
                 Path(partial).unlink(missing_ok=True)
-        raise OutputError(
-            f"{path} cannot be written: {error.strerror or error}; choose another place"
-        ) from error
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another place") from error

@@ -9,6 +9,7 @@ in any projection; metres added to an easting are not exact in UTM and wrong in 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -78,7 +79,7 @@ def project(
     lidar_to_ego : array_like of float, shape (4, 4), optional
         Rigid transform from the LiDAR's frame to the vehicle's, for predictions in the LiDAR's frame.
         Identity by default: right only where the LiDAR's axes are the vehicle's (in nuScenes they are not:
-        there x points right and y forward).
+        there x points right and y forward), so that a `UserWarning` says when it was taken for granted.
     footprint : (float, float, float, float), default (-30, -15, 30, 15)
         xmin, ymin, xmax, ymax of what the predictor looks at, in the vehicle's frame, metres.
     drive : str, optional
@@ -126,9 +127,7 @@ def project(
 
     k, n = len(predictions.tokens), len(predictions.coordinates)
     vertex_frame = np.repeat(predictions.frame, np.diff(predictions.offsets))
-    marks = np.concatenate(
-        [[(0.0, 0.0), (_AHEAD_M, 0.0)], box]
-    )  # of every frame: position, a point ahead, the box
+    marks = np.concatenate([[(0.0, 0.0), (_AHEAD_M, 0.0)], box])  # of every frame: position, a point ahead, the box
     seen = ego_to_world(
         predictions.coordinates,
         placing.rotation @ sensor[:3, :3],
@@ -313,16 +312,20 @@ def _footprint_corners(footprint: Sequence[float]) -> Array:
 
 def _sensor_to_ego(lidar_to_ego: ArrayLike | None, predictions: Predictions) -> Array:
     if lidar_to_ego is None:
+        if predictions.frame_kind == "lidar":
+            warnings.warn(
+                f"{predictions.source}: the format is in the LiDAR's frame and no lidar_to_ego was given, so the "
+                "LiDAR's axes are taken for the vehicle's; in nuScenes they are not, and everything comes out turned",
+                UserWarning,
+                stacklevel=3,
+            )
         return np.eye(4)
     if predictions.frame_kind != "lidar":
         raise OptionError(
-            f"lidar_to_ego was given, but the format of {predictions.source} is in the vehicle's frame; "
-            "leave it out"
+            f"lidar_to_ego was given, but the format of {predictions.source} is in the vehicle's frame; leave it out"
         )
     if not is_rigid_motion(lidar_to_ego):
-        raise OptionError(
-            "lidar_to_ego must be a rigid 4x4 matrix: a rotation, a translation, and 0, 0, 0, 1 below"
-        )
+        raise OptionError("lidar_to_ego must be a rigid 4x4 matrix: a rotation, a translation, and 0, 0, 0, 1 below")
     return np.asarray(lidar_to_ego, dtype=np.float64)
 
 
@@ -333,9 +336,7 @@ def _check_positions(marked: Array, poses: Poses, pose_kind: str, target: pyproj
     lost = ~np.isfinite(marked).all(axis=(1, 2))
     if lost.any():
         stamp = poses.timestamp_ns[int(lost.argmax())]
-        raise CrsError(
-            f"{poses.source}: the pose of timestamp {stamp} has no place in {target.name}; check the CRS"
-        )
+        raise CrsError(f"{poses.source}: the pose of timestamp {stamp} has no place in {target.name}; check the CRS")
     low, high = marked.min(axis=(0, 1)), marked.max(axis=(0, 1))
     check_coordinates(target, (low[0], low[1], high[0], high[1]), poses.source)
     if is_local(target) or pose_kind not in ("crs", "offset"):

@@ -242,8 +242,10 @@ def _merge_lines(
     flat = PolylineSets(shapely.get_coordinates(shapes[members]), bounds, counts[first].astype(np.intp))
     result = merge_sets(flat, advance=advance)
     owner = np.repeat(np.arange(len(result)), [len(line) for line in result])
-    lines: NDArray[np.object_] = shapely.linestrings(np.concatenate(result), indices=owner)
-    return lines
+    lines = shapely.linestrings(np.concatenate(result), indices=owner)
+    # In exact arithmetic no vertex comes twice in a row; rounding can make it so.
+    cleaned: NDArray[np.object_] = shapely.remove_repeated_points(lines, 0.0)
+    return cleaned
 
 
 def _report(

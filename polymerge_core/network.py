@@ -105,7 +105,7 @@ def merge_edges(
     if len(lines) == 0:
         return Edges.none()
     tree = shapely.STRtree(lines)
-    vertices = _vertices(lines)
+    vertices = shapely.extract_unique_points(lines)
     # "At most the number just below" is "less than": the comparison of the paper is strict.
     within = np.nextafter(proximity, 0.0)
     found = []
@@ -194,13 +194,6 @@ def breadth_first_depth(count: int, edges: Edges, roots: NDArray[np.intp]) -> ND
     if not np.isfinite(depth).all():
         raise ValueError("a component of the network has no root")
     return depth.astype(np.intp) - 1
-
-
-def _vertices(lines: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Return each line's vertices as one MultiPoint."""
-    coordinates, owner = shapely.get_coordinates(lines, return_index=True)
-    points: NDArray[np.object_] = shapely.multipoints(shapely.points(coordinates), indices=owner)
-    return points
 
 
 def _boxes(lines: NDArray[np.object_], margin: float) -> NDArray[np.object_]:

@@ -101,6 +101,8 @@ def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], opti
     parts = _explode(features)
     parts = _resolve_kinds(parts, options)
     layer_crs, reference, work = _choose_crs(layers, parts, options)
+    if options.crs is not None and all(layer.data.crs is not None for layer in layers):
+        notes["warnings"].append("crs was not used: every layer has a CRS of its own")
     out_crs = reference if options.out_crs is None else parse_crs(options.out_crs)
     if is_local(out_crs) != is_local(work):
         raise CrsError("out_crs cannot be used: plain metric coordinates (crs=local) have no place on Earth")
@@ -112,7 +114,7 @@ def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], opti
     if options.strict and len(left_out):
         first = left_out.iloc[0]
         raise InputError(
-            f"{first['source']}: feature {first['source_fid']} cannot be used: {first['reason']} "
+            f"layer {first['source']!r}: feature {first['source_fid']} cannot be used: {first['reason']} "
             f"({len(left_out)} in all); mend the layer, or run without strict to leave such features out"
         )
     notes["cleaned_vertices"] = int(parts["cleaned"].sum())
@@ -207,10 +209,12 @@ def _choose_crs(
     if reference is None:
         raise CrsError(_no_crs(layers[0].where))
     layer_crs = [reference if crs is None else crs for crs in found]
-    if len({is_local(layer_crs[number]) for number in bounds}) > 1:
+    plain = [layers[number].where for number in bounds if is_local(layer_crs[number])]
+    placed = [layers[number].where for number in bounds if not is_local(layer_crs[number])]
+    if plain and placed:
         raise CrsError(
-            "plain metric coordinates (crs=local) cannot be brought together with data that has a CRS; "
-            "declare the CRS of every layer, or crs=local for all of them"
+            f"{plain[0]} has plain metric coordinates (crs=local) and cannot be brought together with {placed[0]}, "
+            "which has a CRS; give all layers a CRS, or none"
         )
     for number, box in bounds.items():
         check_coordinates(layer_crs[number], box, layers[number].where)

@@ -38,20 +38,19 @@ def canonical_order(parts: pd.DataFrame, attributes: pd.DataFrame) -> tuple[pd.D
         Observations that repeat class and geometry of another one of the same local map, with a reason.
     """
     shapes = parts["shape"].to_numpy()
-    normalised = shapely.to_wkb(shapely.normalize(shapes))
     # The normalised form forgets the direction of digitisation, the raw one settles equal forms.
-    _, key = np.unique(normalised, return_inverse=True)
+    _, key = np.unique(shapely.to_wkb(shapely.normalize(shapes)), return_inverse=True)
     _, exact = np.unique(shapely.to_wkb(shapes), return_inverse=True)
     parts = parts.assign(key=key, exact=exact)
-    parts["rank"] = _instance_rank(parts, normalised)
     parts["tie"] = _tie_break(parts, attributes)
-    columns = ["rank", "key", "class", "exact", "tie", "from_m"]
-    parts = parts.sort_values(columns, kind="stable").reset_index(drop=True)
+    parts["content"] = parts.groupby(["key", "class", "exact", "tie"]).ngroup()
+    parts["rank"] = _instance_rank(parts)
+    parts = parts.sort_values(["rank", "content", "from_m"], kind="stable").reset_index(drop=True)
     twice = parts.duplicated(["is_main", "drive", "instance", "class", "key"]) & ~parts["is_main"]
     duplicates = parts[twice].assign(reason="duplicate")
     table = parts[~twice].reset_index(drop=True)
     table["group"] = _group_in_order(table)
-    return table.drop(columns=["rank", "exact", "tie"]), duplicates
+    return table.drop(columns=["rank", "content", "exact", "tie"]), duplicates
 
 
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
@@ -67,7 +66,7 @@ def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     return (*((0, int(piece), "") if piece.isdecimal() else (1, 0, piece) for piece in pieces), (2, 0, text))
 
 
-def _instance_rank(parts: pd.DataFrame, normalised: NDArray[np.object_]) -> NDArray[np.intp]:
+def _instance_rank(parts: pd.DataFrame) -> NDArray[np.intp]:
     """Rank the local maps; equal content without a name has equal rank, the main map rank -1."""
     group = parts.groupby(["is_main", "instance_kind", "drive", "instance"], sort=False).ngroup().to_numpy()
     drive_start = parts.groupby("drive")["timestamp_ns"].transform("min").to_numpy()
@@ -91,7 +90,8 @@ def _instance_rank(parts: pd.DataFrame, normalised: NDArray[np.object_]) -> NDAr
             "is_main": "first",
         }
     )
-    content = _contents(group, parts["key"].to_numpy(), normalised)
+    # The normalised WKB of all observations first; where it is the same, class, direction and columns.
+    content = zip(_sorted_by(group, parts["key"]), _sorted_by(group, parts["content"]), strict=True)
     keys: list[tuple[Any, ...]] = []
     for row, own in zip(instances.itertuples(index=False), content, strict=True):
         named = row.kind == "column"
@@ -103,22 +103,20 @@ def _instance_rank(parts: pd.DataFrame, normalised: NDArray[np.object_]) -> NDAr
     return rank[group] if len(rank) else np.empty(0, np.intp)
 
 
-def _contents(
-    group: NDArray[np.intp], key: NDArray[np.intp], normalised: NDArray[np.object_]
-) -> list[tuple[bytes, ...]]:
-    """Return for each local map the normalised WKB of its observations, sorted."""
-    order = np.lexsort((key, group))
+def _sorted_by(group: NDArray[np.intp], values: pd.Series[int]) -> list[tuple[int, ...]]:
+    """Return the values of each group, sorted."""
+    order = np.lexsort((values, group))
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    return [tuple(part) for part in np.split(normalised[order], starts[1:])] if len(group) else []
+    return [tuple(part.tolist()) for part in np.split(values.to_numpy()[order], starts[1:])] if len(group) else []
 
 
 def _tie_break(parts: pd.DataFrame, attributes: pd.DataFrame) -> NDArray[np.object_]:
-    """Return a text that tells apart observations whose geometry and local map are the same."""
+    """Return a text that tells apart observations whose class and geometry are the same."""
     tie = np.full(len(parts), "", dtype=object)
-    same = parts.duplicated(["rank", "class", "exact"], keep=False).to_numpy()
+    same = parts.duplicated(["class", "exact"], keep=False).to_numpy()
+    own = parts.loc[same, ["as_polygon", "score", "main_id", "weight", "looks"]].to_numpy(dtype=object).tolist()
     values = attributes.iloc[parts.loc[same, "feature"]].itertuples(index=False, name=None)
-    scores = parts.loc[same, "score"]
-    tie[same] = [repr((score, *map(str, row))) for score, row in zip(scores.tolist(), values, strict=True)]
+    tie[same] = [repr((*row, *map(str, theirs))) for row, theirs in zip(own, values, strict=True)]
     return tie
 
 

@@ -169,11 +169,18 @@ def feet(points: Array, start: Array, end: Array) -> tuple[Array, Array, Array]:
         Position on each segment, its point nearest to the point, and the squared distance between them.
     """
     along = end - start
-    inner = (points - start) * along
+    inner = points - start
+    inner *= along
+    parameter = inner[0]
+    parameter += inner[1]
     square = along * along
-    parameter = np.minimum(np.maximum((inner[0] + inner[1]) / (square[0] + square[1]), 0.0), 1.0)
+    parameter /= square[0] + square[1]
+    np.maximum(parameter, 0.0, out=parameter)
+    np.minimum(parameter, 1.0, out=parameter)
+    foot = parameter * along
+    foot += start
     # B + 1 (C - B) need not be C in floating point; the scenarios ask whether the foot IS a vertex.
-    foot = np.where(parameter == 1.0, end, start + parameter * along)
+    np.copyto(foot, end, where=parameter == 1.0)
     off = points - foot
     off *= off
     return parameter, foot, off[0] + off[1]

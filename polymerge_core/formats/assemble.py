@@ -23,9 +23,7 @@ class Frame(NamedTuple):
     scores: Sequence[Any]
 
 
-def assemble(
-    frames: Iterable[Frame], *, frame_kind: Literal["ego", "lidar"], source: str, where: str
-) -> Predictions:
+def assemble(frames: Iterable[Frame], *, frame_kind: Literal["ego", "lidar"], source: str, where: str) -> Predictions:
     """Flatten frames into `Predictions`, leaving out the vectors that are no lines.
 
     Parameters
@@ -122,9 +120,7 @@ def declared_classes(document: dict[str, Any], default: Sequence[str], where: st
         return default
     place = f"{where}: class_names in meta"
     names = require(meta["class_names"], list, place)
-    return [
-        clean_name(require(name, str, f"{place}, entry {number}"), place) for number, name in enumerate(names)
-    ]
+    return [clean_name(require(name, str, f"{place}, entry {number}"), place) for number, name in enumerate(names)]
 
 
 def frame_of_records(token: str, vectors: Any, class_names: Sequence[str], where: str) -> Frame:
@@ -168,9 +164,7 @@ def _line(points: Any, where: str) -> NDArray[np.float64]:
     if line.shape == (0,):
         return np.empty((0, 2))
     if line.ndim != 2 or line.shape[1] not in (2, 3):
-        raise InputError(
-            f"{where}: expected points [x, y] or [x, y, z], found an array of shape {line.shape}"
-        )
+        raise InputError(f"{where}: expected points [x, y] or [x, y, z], found an array of shape {line.shape}")
     return line[:, :2]
 
 

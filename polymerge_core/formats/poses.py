@@ -79,9 +79,7 @@ class _Table(NamedTuple):
 
     def text(self, name: str) -> pd.Series[str]:
         if name not in self.columns:
-            raise InputError(
-                f"{self.where}: there is no column {name!r}; the columns are {', '.join(self.columns)}"
-            )
+            raise InputError(f"{self.where}: there is no column {name!r}; the columns are {', '.join(self.columns)}")
         return self.columns[name]
 
     def numbers(self, name: str) -> Array:
@@ -89,11 +87,7 @@ class _Table(NamedTuple):
         bad = ~column.str.fullmatch(_NUMBER).to_numpy(dtype=bool)
         if bad.any():
             row = int(bad.argmax())
-            hint = (
-                "; write it with a decimal point"
-                if re.fullmatch(r"\s*[+-]?[0-9]+,[0-9]+\s*", column[row])
-                else ""
-            )
+            hint = "; write it with a decimal point" if re.fullmatch(r"\s*[+-]?[0-9]+,[0-9]+\s*", column[row]) else ""
             raise InputError(f"{self.rows[row]}, column {name}: {column[row]!r} is not a number{hint}")
         return column.to_numpy(dtype=np.float64)
 
@@ -102,9 +96,7 @@ class _Table(NamedTuple):
         if not any(name in self.columns for name in names):
             return None
         columns = [self.numbers(name) for name in names]
-        columns += [
-            self.numbers(name) if name in self.columns else np.zeros(len(self.rows)) for name in optional
-        ]
+        columns += [self.numbers(name) if name in self.columns else np.zeros(len(self.rows)) for name in optional]
         return np.column_stack(columns)
 
 
@@ -117,10 +109,7 @@ def _from_csv(text: str, where: str) -> Poses:
         raise InputError(f"{table.rows[row]}, column timestamp_ns: {stamps[row]!r} is not a whole number")
     tokens = None
     if "token" in table.columns:
-        tokens = [
-            clean_name(token.strip(), row)
-            for token, row in zip(table.columns["token"], table.rows, strict=True)
-        ]
+        tokens = [clean_name(token.strip(), row) for token, row in zip(table.columns["token"], table.rows, strict=True)]
     geodetic = table.group(_GEODETIC, optional=("height_m",))
     heading = table.numbers("heading_deg") if "heading_deg" in table.columns else None
     translation = table.group(_POSITION, optional=("tz_m",))
@@ -159,9 +148,7 @@ def _read_table(text: str, where: str) -> _Table:
     header = [name.strip() for name in records[0]]
     repeated = sorted({name for name in header if header.count(name) > 1})
     if repeated:
-        raise InputError(
-            f"{where}: the column {repeated[0]!r} stands twice in the header; keep one of the two"
-        )
+        raise InputError(f"{where}: the column {repeated[0]!r} stands twice in the header; keep one of the two")
     for record, row in zip(records[1:], rows[1:], strict=True):
         if len(record) != len(header):
             raise InputError(
@@ -170,9 +157,7 @@ def _read_table(text: str, where: str) -> _Table:
             )
     cells = pd.DataFrame(records[1:], columns=header, dtype="object")
     if delimiter != ",":  # where commas do not separate, a single one can only be a decimal comma
-        cells = cells.apply(
-            lambda column: column.str.replace(r"^(\s*[+-]?\d*),(\d+\S*\s*)$", r"\1.\2", regex=True)
-        )
+        cells = cells.apply(lambda column: column.str.replace(r"^(\s*[+-]?\d*),(\d+\S*\s*)$", r"\1.\2", regex=True))
     return _Table({name: cells[name] for name in header}, rows[1:], where)
 
 
@@ -232,9 +217,7 @@ def _rigid_motion(entry: dict[str, Any], place: str) -> tuple[Array | None, Arra
     rotation = translation = None
     if "matrix" in entry:
         if "rotation" in entry or "translation" in entry:
-            raise InputError(
-                f"{place} has both 'matrix' and 'rotation' or 'translation'; keep one of the two"
-            )
+            raise InputError(f"{place} has both 'matrix' and 'rotation' or 'translation'; keep one of the two")
         matrix = _shaped(entry["matrix"], ((4, 4),), f"{place}, matrix")
         if not np.allclose(matrix[3], (0, 0, 0, 1), rtol=0, atol=RIGID_TOLERANCE):
             raise InputError(f"{place}: the last row of the matrix must be 0, 0, 0, 1")
@@ -275,9 +258,7 @@ def _all_or_none(values: list[Any], name: str, rows: Sequence[str]) -> list[Any]
     return None if lacking else values
 
 
-def _stacked(
-    values: list[Array | None], name: str, rows: Sequence[str], width: tuple[int, ...]
-) -> Array | None:
+def _stacked(values: list[Array | None], name: str, rows: Sequence[str], width: tuple[int, ...]) -> Array | None:
     present = _all_or_none(values, name, rows)
     return None if present is None else np.array(present, dtype=np.float64).reshape(len(values), *width)
 
@@ -292,9 +273,7 @@ def _from_mixed(rotations: list[Array], rows: Sequence[str]) -> Array:
     for kind, read in ((True, _from_matrices), (False, _from_quaternions)):
         members = np.flatnonzero(are_matrices == kind)
         if len(members):
-            matrices[members] = read(
-                np.array([rotations[i] for i in members]), [rows[int(i)] for i in members]
-            )
+            matrices[members] = read(np.array([rotations[i] for i in members]), [rows[int(i)] for i in members])
     return matrices
 
 
@@ -305,8 +284,7 @@ def _from_quaternions(quaternions: Array, rows: Sequence[str]) -> Array:
     if bad.any():
         row = int(bad.argmax())
         raise InputError(
-            f"{rows[row]}: the quaternion has length {length[row]:.6g}, not 1; "
-            "give a unit quaternion, scalar first"
+            f"{rows[row]}: the quaternion has length {length[row]:.6g}, not 1; give a unit quaternion, scalar first"
         )
     return quaternion_to_matrix(quaternions)
 

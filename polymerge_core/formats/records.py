@@ -114,9 +114,7 @@ class Poses:
         for name, value in arrays.items():
             expected = (len(self.timestamp_ns), *of_one.get(name, ()))
             if np.shape(value) != expected:
-                raise InputError(
-                    f"{self.source}: {name} has the shape {np.shape(value)} instead of {expected}"
-                )
+                raise InputError(f"{self.source}: {name} has the shape {np.shape(value)} instead of {expected}")
         if self.rotation is not None and not is_rigid(self.rotation).all():
             row = int((~is_rigid(self.rotation)).argmax())
             raise InputError(f"{self.source}: the rotation of pose {row} is not rigid")

@@ -69,9 +69,7 @@ def parse_json(text: str, where: str) -> Any:
             "the file may be cut off or edited by hand"
         ) from error
     except RecursionError as error:
-        raise InputError(
-            f"{where}: the JSON is nested too deep to be a list of map elements or poses"
-        ) from error
+        raise InputError(f"{where}: the JSON is nested too deep to be a list of map elements or poses") from error
     except ValueError as error:  # a whole number of thousands of digits
         raise InputError(f"{where}: the JSON holds a number that cannot be read ({error})") from error
 

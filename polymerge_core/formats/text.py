@@ -15,10 +15,7 @@ from polymerge_core.errors import InputError
 #: Larger files are refused: parsed, they would fill the memory of most machines.
 MAX_BYTES = 2 * 1024**3
 
-_CONVERT = (
-    "convert it to JSON with the converter in the README, "
-    "run in the environment of the predictor that wrote it"
-)
+_CONVERT = "convert it to JSON with the converter in the README, run in the environment of the predictor that wrote it"
 _UNPACK = "unpack it and give the JSON or CSV file inside"
 
 

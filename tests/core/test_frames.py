@@ -258,8 +258,10 @@ def test_lidar_predictions_go_through_the_vehicle_frame():
     assert maps.instances.geometry[0].equals_exact(shapely.box(85, 170, 115, 230), 1e-9, normalize=True)
 
 
-def test_without_a_transform_the_lidar_frame_is_taken_for_the_vehicle_frame():
-    lidar, ego = (project(seen(LEFT_10, frame_kind=kind), at((1, 2)), crs="local") for kind in ("lidar", "ego"))
+def test_without_a_transform_the_lidar_frame_is_taken_for_the_vehicle_frame_with_a_warning():
+    ego = project(seen(LEFT_10), at((1, 2)), crs="local")
+    with pytest.warns(UserWarning, match="no lidar_to_ego was given"):
+        lidar = project(seen(LEFT_10, frame_kind="lidar"), at((1, 2)), crs="local")
     assert lidar.observations.geometry[0].equals(ego.observations.geometry[0])
 
 
@@ -475,6 +477,11 @@ def test_a_crs_that_does_not_fit_the_kind_of_pose_is_refused(crs, kind, message)
 def test_metres_are_not_added_to_web_mercator():
     with pytest.raises(CrsError, match=r"a metre of .*Pseudo-Mercator is .*% off a metre on the ground.*geodetic"):
         project(seen(LEFT_10), at((1_000_000, 6_600_000)), crs="EPSG:3857")
+
+
+def test_a_pose_without_a_place_in_the_crs_is_named():
+    with pytest.raises(CrsError, match=r"the pose of timestamp 0 has no place in .*Lambert-93"):
+        project(seen([]), on_earth(-90.0, 3.0, 0.0), crs="EPSG:2154", pose_kind="geodetic")
 
 
 def test_poses_far_from_where_the_crs_is_used_are_refused():

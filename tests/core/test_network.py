@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from polymerge_core import network
+from polymerge_core.errors import InputError
 from polymerge_core.network import Edges, breadth_first_depth, components, merge_edges, polyline_merge_check
 from tests import reference
 
@@ -249,6 +250,14 @@ class TestMergeEdges:
         expected = sorted([*zip(row, row + 1, strict=True), *zip(row + 1, row + 2, strict=True)])
         assert pairs_of(edges) == expected
 
+    def test_of_more_pairs_than_memory_is_meant_to_hold_is_refused(self, monkeypatch):
+        lines = lines_from(*[[(0, 0.3 * k), (5, 0.3 * k)] for k in range(3)])
+        monkeypatch.setattr(network, "MAX_EDGES", 3)
+        assert len(pairs_of(merge_edges(lines, none_is_main(lines), 1.0))) == 3
+        monkeypatch.setattr(network, "MAX_EDGES", 2)
+        with pytest.raises(InputError, match="smaller proximity"):
+            merge_edges(lines, none_is_main(lines), 1.0)
+
 
 class TestComponents:
     @pytest.mark.parametrize(
@@ -285,11 +294,16 @@ class TestBreadthFirstDepth:
             pytest.param(4, [(0, 1), (1, 2), (0, 3), (2, 3)], [0], [0, 1, 2, 1], id="cycle: the shorter way"),
             pytest.param(5, [(0, 3), (1, 4)], [3, 1, 2], [1, 0, 0, 0, 1], id="several components"),
             pytest.param(2, [], [0, 1], [0, 0], id="no edges"),
+            pytest.param(0, [], [], [], id="nothing"),
         ],
     )
     def test_depths(self, count, pairs, roots, depths):
-        result = breadth_first_depth(count, edges_from(*pairs), np.array(roots))
+        result = breadth_first_depth(count, edges_from(*pairs), np.array(roots, dtype=np.intp))
         assert result.tolist() == depths
+
+    def test_of_a_component_without_a_root_is_refused(self):
+        with pytest.raises(ValueError, match="root"):
+            breadth_first_depth(3, edges_from((0, 1)), np.array([0]))
 
     @given(graphs(), st.randoms(use_true_random=False))
     def test_agree_with_networkx(self, drawn, choice):

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+
 from polymerge_core import outputs as module
 from polymerge_core.errors import OutputError
 from polymerge_core.outputs import StagedOutputs
@@ -54,7 +55,7 @@ def test_an_existing_output_needs_overwrite(old):
 @pytest.mark.parametrize("error", [RuntimeError("x"), KeyboardInterrupt(), SystemExit(3)], ids=repr)
 def test_nothing_changes_when_the_run_ends_early(tmp_path, old, error):
     other = tmp_path / "report.json"
-    with pytest.raises(type(error)), StagedOutputs(overwrite=True) as outputs:
+    with pytest.raises(type(error)), StagedOutputs(overwrite=True) as outputs:  # noqa: PT012
         outputs.stage(old).write_text("new")
         outputs.stage(other).write_text("{}")
         raise error
@@ -77,7 +78,7 @@ def test_a_move_that_fails_brings_all_earlier_ones_back(tmp_path, monkeypatch, f
         return replace(self, target)
 
     monkeypatch.setattr(Path, "replace", replace_once_less)
-    with pytest.raises(OutputError, match="Input/output error"), StagedOutputs(overwrite=True) as outputs:
+    with pytest.raises(OutputError, match="Input/output error"), StagedOutputs(overwrite=True) as outputs:  # noqa: PT012
         for target in targets:
             outputs.stage(target).write_text("new")
     assert [target.read_text() if target.exists() else None for target in targets] == ["old a", None, "old c"]
@@ -112,7 +113,7 @@ def test_an_interrupt_while_files_are_moved_changes_nothing(tmp_path, monkeypatc
 
     monkeypatch.setattr(module, "_move", interrupted)
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), StagedOutputs() as outputs:
+    with pytest.raises(KeyboardInterrupt), StagedOutputs() as outputs:  # noqa: PT012
         for target in targets:
             outputs.stage(target).write_text("new")
     assert list(tmp_path.iterdir()) == []
@@ -187,7 +188,7 @@ def test_an_input_named_relatively_is_known(tmp_path, old, monkeypatch):
 
 def test_two_outputs_cannot_be_one_file(tmp_path):
     refuse("two outputs", [tmp_path / "a.json", tmp_path / "." / "a.json"])
-    with pytest.raises(OutputError, match="two outputs"), StagedOutputs() as outputs:
+    with pytest.raises(OutputError, match="two outputs"), StagedOutputs() as outputs:  # noqa: PT012
         outputs.stage(tmp_path / "a.json").write_text("x")
         outputs.stage(tmp_path / "a.json")
     assert list(tmp_path.iterdir()) == []
@@ -256,7 +257,7 @@ def test_an_overwritten_file_keeps_its_permissions(old):
 
 
 def test_a_full_disk_is_said_so(tmp_path, old):
-    with pytest.raises(OutputError, match="disk full"), StagedOutputs(overwrite=True) as outputs:
+    with pytest.raises(OutputError, match="disk full"), StagedOutputs(overwrite=True) as outputs:  # noqa: PT012
         outputs.stage(old)
         raise OSError(errno.ENOSPC, "No space left on device")
     assert old.read_text() == "old"
@@ -270,7 +271,7 @@ def test_a_file_size_limit_is_an_error_and_not_the_end_of_the_process(tmp_path, 
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     previous = signal.signal(signal.SIGXFSZ, deadly)
     try:
-        with pytest.raises(OutputError, match="disk full"), StagedOutputs(overwrite=True) as outputs:
+        with pytest.raises(OutputError, match="disk full"), StagedOutputs(overwrite=True) as outputs:  # noqa: PT012
             resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
             outputs.stage(old).write_bytes(b"x" * 5000)
         assert signal.getsignal(signal.SIGXFSZ) is deadly

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from polymerge_core import polyline
 from polymerge_core.polyline import merge_polyline, merge_polylines, merge_vertex, project_points
 from tests import reference
 
@@ -132,9 +133,7 @@ class TestFourScenarios:
             pytest.param(BENT, (8, 5), [(0, 0), (10, 0), (9, 5), (10, 10)], id="1: in the second segment"),
             pytest.param(STRAIGHT, (4, 0), [(0, 0), (4, 0), (10, 0)], id="1: point on the base itself"),
             pytest.param(BENT, (12, -2), [(0, 0), (11, -1), (10, 10)], id="2: outside a corner"),
-            pytest.param(
-                TWO_SEGMENTS, (10, 4), [(0, 0), (10, 2), (20, 0)], id="2: straight beside an inner vertex"
-            ),
+            pytest.param(TWO_SEGMENTS, (10, 4), [(0, 0), (10, 2), (20, 0)], id="2: straight beside an inner vertex"),
             pytest.param(TWO_SEGMENTS, (10, 0), TWO_SEGMENTS, id="2: point equals the inner vertex"),
             pytest.param(STRAIGHT, (-2, 1), [(-2, 1), (0, 0), (10, 0)], id="3: before the first vertex"),
             pytest.param(STRAIGHT, (0, 1), [(0, 1), (0, 0), (10, 0)], id="3: beside the first vertex"),
@@ -150,9 +149,7 @@ class TestFourScenarios:
     @pytest.mark.parametrize(
         ("point", "expected"),
         [
-            pytest.param(
-                (-2, -4), [(-1, -2), (10, 0), (10, 10), (0, 10), (-1, -2)], id="2: both copies of the start"
-            ),
+            pytest.param((-2, -4), [(-1, -2), (10, 0), (10, 10), (0, 10), (-1, -2)], id="2: both copies of the start"),
             pytest.param((0, 0), SQUARE, id="2: point equals the start"),
             pytest.param((12, 14), [(0, 0), (10, 0), (11, 12), (0, 10), (0, 0)], id="2: another corner"),
             pytest.param((5, -2), [(0, 0), (5, -1), (10, 0), (10, 10), (0, 10), (0, 0)], id="1: first side"),
@@ -245,9 +242,7 @@ class TestMergePolyline:
         base, other = [(0, 0), (10, 0), (20, 0)], [(0, 1), (10, 1), (20, 1)]
         t = (10 * 10 + 0.5 * -0.5) / (10**2 + 0.5**2)
         inserted = ((10 + 10 * t + 20) / 2, (0.5 - 0.5 * t + 1) / 2)
-        assert_same_line(
-            merge_polyline(array(base), array(other)), [(0, 1), (0, 0), (10, 0.5), inserted, (20, 0)]
-        )
+        assert_same_line(merge_polyline(array(base), array(other)), [(0, 1), (0, 0), (10, 0.5), inserted, (20, 0)])
 
     def test_inputs_are_not_changed(self):
         base, other = array(BENT), array([(4, 2), (12, -2), (11, 12)])
@@ -338,7 +333,7 @@ class TestLongBase:
         # A comb of 600 teeth: every point of the line y = 10 is as near to two neighbouring teeth.
         x = np.arange(1200) // 2 * 2.0
         comb = np.column_stack((x, np.tile([0.0, 20.0, 20.0, 0.0], 300)))
-        others = [np.column_stack((np.arange(1.0, 1199, 2), np.full(599, 10.0)))]
+        others = [np.column_stack((np.arange(1.0, 1199, 6), np.full(200, 10.0)))]
         assert_same_line(merge_polylines(comb, others), self.by_reference(comb, others))
 
     def test_many_points_in_one_place(self, winding, rng):
@@ -346,8 +341,85 @@ class TestLongBase:
         assert_same_line(merge_polylines(winding, others), self.by_reference(winding, others))
 
     def test_base_that_grows_long_while_it_is_merged(self, rng):
-        others = [
-            np.column_stack((np.sort(rng.uniform(0, 100, 60)), rng.normal(0, 0.3, 60))) for _ in range(20)
-        ]
+        others = [np.column_stack((np.sort(rng.uniform(0, 100, 60)), rng.normal(0, 0.3, 60))) for _ in range(20)]
         base = array([(0, 0), (50, 0), (100, 0)])
         assert_same_line(merge_polylines(base, others), self.by_reference(base, others))
+
+    @pytest.mark.parametrize("count", [2, 3, 63, 64, 65, 127, 128, 129, 130, 255, 256, 257, 258, 1023, 1025])
+    def test_of_any_length(self, count, rng):
+        heading = np.cumsum(rng.normal(0, 0.2, count))
+        base = np.cumsum(np.column_stack((np.cos(heading), np.sin(heading))), axis=0)
+        others = [
+            base[rng.integers(0, count, 12)] + rng.normal(0, 0.5, (12, 2)),
+            base[-1] + np.array([(0.5, 0.1), (2, 1)]),
+            base[0] - np.array([(0.5, 0.1), (2, 1)]),
+        ]
+        assert_same_line(merge_polylines(base, others), self.by_reference(base, others))
+
+    def test_vertices_drawn_far_out_are_found_there_from_both_sides(self):
+        # Each spike makes a vertex leave the surroundings of its neighbours: (x, 0) becomes (x, 20).
+        base = np.column_stack((10.0 * np.arange(1500), np.zeros(1500)))
+        others = [np.array([(x, 40), (x + 1.5, 18), (x - 1.5, 18)]) for x in base[8:-8:8, 0]]
+        assert_same_line(merge_polylines(base, others), self.by_windows(base, others))
+
+    def test_vertices_reached_by_the_segment_behind_them(self, rng):
+        # By rounding, the foot on the segment before a corner may lie farther off than the corner itself.
+        zigzag = np.column_stack((10.0 * np.arange(1500), np.tile([-3.0, 3.0], 750)))
+        base = zigzag + rng.normal(0, 0.5, zigzag.shape)
+        others = []
+        for index in range(8, 1492, 4):
+            corner, around = base[index], [tuple(vertex) for vertex in base[index - 3 : index + 4].tolist()]
+            for point in beside_the_end(rng, *base[index - 1 : index + 2], count=60):
+                foot = reference.project(tuple(point), around)
+                if (foot.segment, foot.parameter) == (3, 0.0):
+                    spike = (corner + point) / 2
+                    others.append(np.vstack((point, np.add(spike, [(-1.5, 0.5), (1.5, 0.5)]))))
+                    break
+        assert len(others) > 300
+        assert_same_line(merge_polylines(base, others), self.by_windows(base, others))
+
+    @staticmethod
+    def by_windows(base, others):
+        """Merge by the reference lines that lie along x, each with the part of the base within 60 m."""
+        line = [tuple(vertex) for vertex in base.tolist()]
+        for other in others:
+            near = [index for index, vertex in enumerate(line) if abs(vertex[0] - other[0, 0]) < 60]
+            part = line[near[0] : near[-1] + 1]
+            line[near[0] : near[-1] + 1] = reference.merge_polyline(part, [tuple(v) for v in other.tolist()])
+        return line
+
+
+def beside_the_end(rng, before, end, after, *, count):
+    """Points on the perpendicular to the segment before-end at its end, on the side away from `after`."""
+    along = (end - before) / np.linalg.norm(end - before)
+    normal = np.array([-along[1], along[0]])
+    outwards = normal if normal @ (end - after) > 0 else -normal
+    return end + outwards * rng.uniform(0.1, 15, (count, 1))
+
+
+@pytest.mark.parametrize("count", [0, 1500], ids=["a few vertices", "many vertices"])
+def test_start_of_a_closed_base_reached_by_its_last_segment(rng, count):
+    # By rounding, the foot on the first segment may lie farther off than the start itself.
+    found = 0
+    for _ in range(200 if count == 0 else 60):
+        second, start, last = rng.uniform(0, 100, (3, 2))
+        way_round = np.column_stack((np.linspace(second[0], last[0], count + 3)[1:-1], np.full(count + 1, -200)))
+        ring = np.vstack((start, second, way_round, last, start))
+        (point,) = beside_the_end(rng, second, start, last, count=1)
+        line = [tuple(vertex) for vertex in ring.tolist()]
+        foot = reference.project(tuple(point), line)
+        if (foot.segment, foot.parameter) == (len(ring) - 2, 1.0):
+            found += 1
+            other = np.vstack((point, np.add(start, [(0.3, 0.2), (-0.3, 0.2), (0.1, -0.4)])))
+            result = merge_polylines(ring, [other])
+            assert result[0].tolist() == result[-1].tolist()
+            assert_same_line(result, reference.merge_polyline(line, [tuple(v) for v in other.tolist()]))
+    assert found > 0
+
+
+def test_projection_of_many_points_in_small_portions_is_the_same(rng, monkeypatch):
+    points, line = rng.uniform(0, 100, (200, 2)), rng.uniform(0, 100, (30, 2))
+    whole = project_points(points, line)
+    monkeypatch.setattr(polyline, "_MATRIX", 100)
+    for part, expected in zip(project_points(points, line), whole, strict=True):
+        assert part.tolist() == expected.tolist()

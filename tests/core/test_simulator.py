@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import shapely
+from geopandas.testing import assert_geodataframe_equal
 
 from benchmarks.make_sample import make_sample
 from benchmarks.noise import CLASS_NAMES, Noise, unit_noise
@@ -38,6 +39,9 @@ def truth_of(*features):
     return gpd.GeoDataFrame({"class": classes}, geometry=gpd.GeoSeries.from_wkt(wkt))
 
 
+FAR_AWAY = truth_of(("divider", "LINESTRING (5000 0, 5020 0)"))
+
+
 def world_vectors(drive, *, offset=(0.0, 0.0)):
     """Project the vectors with the poses of the drive, by plane rotation: label, element, vertices, ego vertices."""
     rows = []
@@ -63,7 +67,7 @@ def frames():
 @pytest.fixture(scope="module")
 def many(town, frames):
     """The drive repeated until its shares mean something."""
-    return [simulate(town, frames, seed=seed) for seed in range(12)]
+    return [simulate(town, frames, seed=seed) for seed in range(6)]
 
 
 def test_same_seed_same_drive_and_another_seed_another(town, frames):
@@ -77,7 +81,7 @@ def test_inputs_are_left_alone(town, frames):
     truth, poses = town.copy(), frames.copy()
     simulate(truth, poses, seed=1)
     pd.testing.assert_frame_equal(poses, frames)
-    gpd.testing.assert_geodataframe_equal(truth, town)
+    assert_geodataframe_equal(truth, town)
 
 
 def test_without_noise_every_vertex_lies_on_its_element_within_the_grid(town, frames):
@@ -123,7 +127,8 @@ def test_offset_moves_the_poses_into_the_crs_of_the_truth(town, frames):
     drive = simulate(town, city, seed=2, offset=offset)
     plain = simulate(town, frames, seed=2)
     assert drive.predictions == plain.predictions
-    np.testing.assert_allclose(drive.poses[["tx_m", "ty_m"]] + offset, plain.poses[["tx_m", "ty_m"]], atol=1e-6)
+    moved, expected = (each.poses[["tx_m", "ty_m"]].to_numpy() for each in (drive, plain))
+    np.testing.assert_allclose(moved + offset, expected, atol=1e-6)
 
 
 def test_a_part_switched_off_leaves_the_other_random_numbers_as_they_were(town, frames):
@@ -144,9 +149,9 @@ def test_a_part_switched_off_leaves_the_other_random_numbers_as_they_were(town, 
     assert kept == given
 
 
-def test_pose_error_has_the_set_size(town):
+def test_pose_error_has_the_set_size():
     poses = poses_at(np.zeros(800)).assign(timestamp_ns=np.arange(800))
-    drive = simulate(town, poses, seed=1)
+    drive = simulate(FAR_AWAY, poses, seed=1)
     error = drive.poses[["tx_m", "ty_m"]] - poses[["tx_m", "ty_m"]]
     yaw = np.degrees(2 * np.arctan2(drive.poses["qz"], drive.poses["qw"]))
     np.testing.assert_allclose(error.std(), 0.15, rtol=0.1)
@@ -154,12 +159,12 @@ def test_pose_error_has_the_set_size(town):
 
 
 @pytest.mark.parametrize(("share", "within"), [(0.0, 0.15), (1.0, 0.0), (0.5, 0.15 * np.sqrt(0.5))], ids=str)
-def test_pose_error_is_split_between_frame_and_drive(town, share, within):
+def test_pose_error_is_split_between_frame_and_drive(share, within):
     poses = poses_at(np.zeros(400)).assign(timestamp_ns=np.arange(400))
     noise = replace(Noise(), pose_drive_share=share)
     spread, whole = [], []
     for seed in range(12):
-        east = simulate(town, poses, seed=seed, noise=noise).poses["tx_m"].to_numpy()
+        east = simulate(FAR_AWAY, poses, seed=seed, noise=noise).poses["tx_m"].to_numpy()
         spread.append(east.std())
         whole.append(east[0])
     assert np.mean(spread) == pytest.approx(within, rel=0.05, abs=1e-12)
@@ -218,22 +223,18 @@ def test_scaled_noise_scales_errors_and_keeps_shares():
     assert (noise.missed, noise.false, noise.correlation_m) == (0.2, 0.08, 12.0)
 
 
-def test_missed_and_false_shares_come_out_near_their_settings(town, frames, many):
-    sure = replace(Noise(), missed=0.0, split=0.0, false=0.0)
-    ids = [[e for f in d.predictions["results"].values() for e in f["element_id"]] for d in many]
-    true_seen = sum(element is not None for each in ids for element in each)
-    every = sum(
-        len(frame["vectors"])
-        for seed in range(len(many))
-        for frame in simulate(town, frames, seed=seed, noise=sure).predictions["results"].values()
-    )
-    splits_off = [simulate(town, frames, seed=s, noise=replace(Noise(), split=0.0)) for s in range(len(many))]
-    seen = sum(e is not None for d in splits_off for f in d.predictions["results"].values() for e in f["element_id"])
-    assert 1 - seen / every == pytest.approx(0.20, abs=0.03)
-    assert true_seen > seen
-    assert sum(element is None for each in ids for element in each) / sum(map(len, ids)) == pytest.approx(
-        0.08, abs=0.02
-    )
+def test_lines_are_missed_at_the_set_share():
+    truth = truth_of(("divider", "LINESTRING (-25 2, 25 2)"))
+    poses = poses_at(np.zeros(400)).assign(timestamp_ns=np.arange(400))
+    noise = replace(Noise.none(), missed=0.2)
+    frames = simulate(truth, poses, seed=1, noise=noise).predictions["results"].values()
+    assert np.mean([len(frame["vectors"]) == 0 for frame in frames]) == pytest.approx(0.2, abs=0.05)
+
+
+def test_false_detections_come_at_the_set_share(many):
+    ids = [e for drive in many for frame in drive.predictions["results"].values() for e in frame["element_id"]]
+    assert len(ids) > 900
+    assert np.mean([element is None for element in ids]) == pytest.approx(0.08, abs=0.025)
 
 
 def test_long_lines_are_split_at_the_set_share():
@@ -256,7 +257,7 @@ def test_ends_are_cut_by_a_metre_or_so():
 
 def test_half_of_the_lines_are_digitised_backwards():
     truth = truth_of(("divider", "LINESTRING (-25 2, 25 2)"))
-    poses = poses_at(np.zeros(600)).assign(timestamp_ns=np.arange(600))
+    poses = poses_at(np.zeros(300)).assign(timestamp_ns=np.arange(300))
     vectors = world_vectors(simulate(truth, poses, seed=1))
     backwards = [ego[0, 0] > ego[-1, 0] for _, element, _, ego in vectors if element == 0]
     assert np.mean(backwards) == pytest.approx(0.5, abs=0.07)
@@ -366,7 +367,7 @@ def test_the_committed_sample_is_what_make_sample_writes(tmp_path):
     for name in ("predictions.json", "poses.csv"):
         assert (tmp_path / name).read_bytes() == (SAMPLE / name).read_bytes()
     fresh, kept = (gpd.read_file(folder / "reference.gpkg", layer="ground_truth") for folder in (tmp_path, SAMPLE))
-    gpd.testing.assert_geodataframe_equal(fresh, kept)
+    assert_geodataframe_equal(fresh, kept)
     assert list(kept.columns) == ["element_id", "class", "geometry"]
     assert kept.crs.to_epsg() == 32632
     assert sum(file.stat().st_size for file in SAMPLE.iterdir()) < 300_000
