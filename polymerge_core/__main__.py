@@ -15,9 +15,10 @@ import numpy as np
 
 import polymerge_core as pm
 from polymerge_core import console
+from polymerge_core.crs import parse_crs
 from polymerge_core.environment import library_versions
 from polymerge_core.formats import read_matrix
-from polymerge_core.io import layer_targets, split_source, stage_layers
+from polymerge_core.io import layer_targets, source_files, stage_layers
 from polymerge_core.options import AGGREGATES, INSTANCE_FROM, METHODS, Options
 from polymerge_core.outputs import StagedOutputs
 
@@ -31,6 +32,16 @@ def _decorate(*options: Callable[[_Command], _Command]) -> Callable[[_Command], 
         return command
 
     return apply
+
+
+def _known_crs(_context: click.Context, _option: click.Parameter, text: str | None) -> str | None:
+    """Refuse a CRS that nobody knows before anything is read."""
+    if text is not None:
+        try:
+            parse_crs(text)
+        except pm.CrsError as error:
+            raise pm.OptionError(str(error)) from error
+    return text
 
 
 _output = click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The file to write.")
@@ -54,12 +65,12 @@ _reading_options = _decorate(
     click.option("--timestamp-field", help="Column that orders the local maps.  [default: timestamp, if any]"),
     click.option("--proximity", type=float, default=1.0, show_default=True, help="Th_prox in metres."),
     click.option("--area", multiple=True, metavar="CLASS", help="A class of areas, beside ped_crossing; repeatable."),
-    click.option("--crs", help="CRS of layers without one, such as EPSG:32632, or local."),
+    click.option("--crs", callback=_known_crs, help="CRS of layers without one, such as EPSG:32632, or local."),
     click.option("--strict", is_flag=True, help="A feature that cannot be used is an error."),
 )
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, no_args_is_help=False)
 @click.version_option(pm.__version__, prog_name="polymerge")
 def cli() -> None:
     """Merge many overlapping, imperfect digitisations of the same lines into one clean map."""
@@ -68,7 +79,7 @@ def cli() -> None:
 @cli.command()
 @click.argument("predictions", type=click.Path())
 @click.option("--poses", required=True, type=click.Path(), help="Poses as CSV or JSON.")
-@click.option("--crs", required=True, help="CRS of the result, such as EPSG:32617, or local.")
+@click.option("--crs", required=True, callback=_known_crs, help="CRS of the result, such as EPSG:32617, or local.")
 @click.option(
     "--pose-kind",
     type=click.Choice(["crs", "origin", "geodetic", "offset"]),
@@ -92,8 +103,8 @@ def cli() -> None:
 def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None, **chosen: Any) -> None:
     """Carry a predictor's local maps from the vehicle's frame into the world."""
     run = _split_off(chosen)
-    for name, count in (("origin", 2), ("pose_offset", 2), ("footprint", 4)):
-        chosen[name] = _numbers(name, chosen[name], count)
+    for name, form in (("origin", "LAT,LON"), ("pose_offset", "E,N"), ("footprint", "XMIN,YMIN,XMAX,YMAX")):
+        chosen[name] = _numbers(name, chosen[name], form)
     chosen["drive"] = chosen["drive"] or output.stem
     inputs = [predictions, poses, *([lidar_to_ego] if lidar_to_ego else [])]
     with _Run(output, inputs, **run) as job:
@@ -108,7 +119,7 @@ def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None
         report = local.report()
         job.report(report)
     console.say(
-        f"{report['observations']} observations of {report['instances']} local maps"
+        f"{_count(report['observations'], 'observation')} of {_count(report['instances'], 'local map')}"
         f"{_left_out(report['left_out'])} -> {job.written}"
     )
 
@@ -124,7 +135,9 @@ def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None
     metavar="[COLUMN=]FUNCTION",
     help=f"How columns are carried: {', '.join(AGGREGATES)}; repeatable.  [default: first]",
 )
-@click.option("--out-crs", help="CRS of the result.  [default: the main map's, else the first layer's]")
+@click.option(
+    "--out-crs", callback=_known_crs, help="CRS of the result.  [default: the main map's, else the first layer's]"
+)
 @_output
 @_run_options
 def merge(local_maps: tuple[str, ...], output: Path, main_map: str | None, **chosen: Any) -> None:
@@ -132,20 +145,21 @@ def merge(local_maps: tuple[str, ...], output: Path, main_map: str | None, **cho
     run = _split_off(chosen)
     chosen["aggregate"] = _aggregate(chosen["aggregate"])
     Options.of(**chosen)  # a wrong value is told before anything is read
-    with _Run(output, [*local_maps, *([main_map] if main_map else [])], **run) as job:
+    with _Run(output, [*local_maps, *([] if main_map is None else [main_map])], **run) as job:
         job.progress(0.0, "reading the files")
         layers = pm.read_local_maps(local_maps)
-        into = pm.read_local_maps([main_map]) if main_map else None
+        into = None if main_map is None else pm.read_local_maps([main_map])
         result = pm.merge(layers, into, progress=job.progress.part(0.05, 0.9), **chosen)
         job.write(result.layers(), 0.9)
         job.report(result.report)
     report = result.report
     for warning in report["warnings"]:
         console.say(f"warning: {warning}")
-    into_what = f" and {report['main_map_elements']} elements of the main map" if main_map else ""
+    kept = report["main_map_elements"]
+    into_what = "" if main_map is None else f" and {_count(kept, 'element')} of the main map"
     console.say(
-        f"{report['observations']} observations of {report['instances']} local maps{into_what} became "
-        f"{report['elements']} elements{_left_out(report['left_out'])} -> {job.written}"
+        f"{_count(report['observations'], 'observation')} of {_count(report['instances'], 'local map')}{into_what} "
+        f"became {_count(report['elements'], 'element')}{_left_out(report['left_out'])} -> {job.written}"
     )
 
 
@@ -158,10 +172,10 @@ def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **c
     """Write who would be merged with whom: layers edges and observations."""
     run = _split_off(chosen)
     Options.of(**chosen)
-    with _Run(output, [*local_maps, *([main_map] if main_map else [])], **run) as job:
+    with _Run(output, [*local_maps, *([] if main_map is None else [main_map])], **run) as job:
         job.progress(0.0, "reading the files")
         layers = pm.read_local_maps(local_maps)
-        into = pm.read_local_maps([main_map]) if main_map else None
+        into = None if main_map is None else pm.read_local_maps([main_map])
         graph = pm.merge_network(layers, into, progress=job.progress.part(0.05, 0.7), **chosen)
         written = pm.network_layers(graph)
         job.write(written, 0.8)
@@ -171,11 +185,13 @@ def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **c
             "edges": len(written["edges"]),
             "components": len(sizes),
             "largest_component": int(sizes.max()) if len(sizes) else 0,
+            "left_out": graph.graph["left_out"]["reason"].value_counts(sort=False).to_dict(),
         }
         job.report(report)
     console.say(
-        f"{report['observations']} observations, {report['edges']} edges, {report['components']} components "
-        f"(the largest has {report['largest_component']}) -> {job.written}"
+        f"{_count(report['observations'], 'observation')}, {_count(report['edges'], 'edge')}, "
+        f"{_count(report['components'], 'component')} (the largest has {report['largest_component']})"
+        f"{_left_out(report['left_out'])} -> {job.written}"
     )
 
 
@@ -211,8 +227,10 @@ class _Run:
         progress: console.ProgressMode,
         watch_stdin: bool,
     ) -> None:
-        self._output, self._report_file = output, report_file
-        files = [split_source(path)[0] for path in inputs]
+        self._output, self._report_file, self._printed = output, report_file, ""
+        if not all(inputs):
+            raise pm.OptionError("the name of an input is empty; name a file")
+        files = [file for path in inputs for file in source_files(path)]
         self._outputs = StagedOutputs(overwrite=overwrite, inputs=files)
         report = [Path(report_file)] if report_file not in (None, "-") else []
         # Which layers a run writes is known at its end; the main one is always there.
@@ -232,6 +250,9 @@ class _Run:
             self._outputs.__exit__(*error)  # type: ignore[arg-type]
         finally:
             self.progress.close()
+        if error[0] is None and self._printed:
+            # Whoever reads this may go on to the outputs, so they must be there.
+            click.echo(self._printed, nl=False)
 
     def write(self, layers: dict[str, Any], fraction: float) -> None:
         """Stage the layers; `fraction` is how far the run is when writing starts."""
@@ -244,12 +265,12 @@ class _Run:
         self.progress(1.0, "done")
 
     def report(self, content: dict[str, Any]) -> None:
-        """Stage the JSON report, or print it where it goes to standard output."""
+        """Stage the JSON report, or keep it until the end where it goes to standard output."""
         if self._report_file is None:
             return
         text = json.dumps(content, indent=2, ensure_ascii=False, default=_plain) + "\n"
         if self._report_file == "-":
-            click.echo(text, nl=False)
+            self._printed = text
         else:
             self._outputs.stage(self._report_file).write_text(text, encoding="utf-8")
 
@@ -259,7 +280,7 @@ def _split_off(chosen: dict[str, Any]) -> dict[str, Any]:
     return {name: chosen.pop(name) for name in ("overwrite", "report_file", "progress", "watch_stdin")}
 
 
-def _numbers(name: str, text: str | None, count: int) -> tuple[float, ...] | None:
+def _numbers(name: str, text: str | None, form: str) -> tuple[float, ...] | None:
     """Read comma-separated numbers."""
     if text is None:
         return None
@@ -267,11 +288,10 @@ def _numbers(name: str, text: str | None, count: int) -> tuple[float, ...] | Non
         numbers = tuple(float(part) for part in text.split(","))
     except ValueError:
         numbers = ()
+    count = form.count(",") + 1
     if len(numbers) != count or not np.isfinite(numbers).all():
-        option = name.replace("_", "-")
         raise pm.OptionError(
-            f"--{option} is {text!r}; it takes {count} numbers with commas between, such as "
-            f"{','.join('12.5' for _ in range(count))}"
+            f"--{name.replace('_', '-')} is {text!r}; it takes {count} numbers with commas between, {form}"
         )
     return numbers
 
@@ -284,6 +304,10 @@ def _aggregate(chosen: tuple[str, ...]) -> str | dict[str, str]:
     if plain:
         return plain[0]
     return dict(entry.rsplit("=", 1) for entry in chosen) or "first"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _left_out(reasons: dict[str, int]) -> str:

@@ -145,7 +145,7 @@ def _explain(error: BaseException) -> tuple[str, int | None]:
         return "interrupted; nothing half-written was left behind", INTERRUPTED
     if isinstance(error, click.ClickException):
         usage = isinstance(error, click.UsageError)
-        hint = " (--help shows the options)" if usage else ""
+        hint = " (see --help)" if usage else ""
         return f"error: {error.format_message()}{hint}", WRONG_USAGE if usage else BAD_DATA
     if isinstance(error, PolymergeError):
         return f"error: {error}", WRONG_USAGE if isinstance(error, OptionError) else BAD_DATA

@@ -179,8 +179,8 @@ def check_coordinates(crs: pyproj.CRS, bounds: Bounds, where: str) -> None:
     outside = not (inside_lon and inside_lat)
     if like_degrees and (outside or area.east - area.west > 180):
         raise CrsError(
-            f"{where}: coordinates from ({xmin:g}, {ymin:g}) to ({xmax:g}, {ymax:g}) look like degrees, but the "
-            f"layer claims {crs.name}, which is projected; {hint}"
+            f"{where}: coordinates from ({xmin:g}, {ymin:g}) to ({xmax:g}, {ymax:g}) look like degrees, "
+            f"and {crs.name} is not in degrees; {hint}"
         )
     if outside:
         raise CrsError(

@@ -127,7 +127,8 @@ def _carry_columns(
             carried[name] = values.reindex(range(len(base))).array
     # Integers were made nullable to bring layers together; where none is missing they are plain again.
     whole = [name for name, dtype in carried.dtypes.items() if dtype == "Int64" and not carried[name].hasnans]
-    return carried.astype(dict.fromkeys(whole, np.int64))
+    means = [name for name, dtype in carried.dtypes.items() if dtype == "Float64"]
+    return carried.astype(dict.fromkeys(whole, np.int64) | dict.fromkeys(means, np.float64))
 
 
 def _chosen_functions(attributes: pd.DataFrame, aggregate: str | Mapping[str, str]) -> dict[Any, str]:

@@ -17,7 +17,6 @@ _PACKAGES = (
     "scipy",
     "networkx",
     "scikit-image",
-    "fiona",
     "pyogrio",
     "pyarrow",
     "matplotlib",

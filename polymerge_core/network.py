@@ -205,5 +205,7 @@ def _boxes(lines: NDArray[np.object_], margin: float) -> NDArray[np.object_]:
 
 
 def _adjacency(count: int, edges: Edges) -> coo_array:
-    # A distance of 0 would read as "no edge" in a sparse matrix, so every edge weighs 1.
-    return coo_array((np.ones(len(edges.first)), (edges.first, edges.second)), shape=(count, count)).tocsr()
+    # A distance of 0 would read as "no edge" in a sparse matrix, so every edge weighs 1. Older scipy's graph
+    # routines take 32-bit indices only.
+    pairs = (edges.first.astype(np.int32), edges.second.astype(np.int32))
+    return coo_array((np.ones(len(edges.first)), pairs), shape=(count, count)).tocsr()

@@ -31,9 +31,7 @@ from polymerge_core.errors import OutputError
 SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg")
 _SHAPEFILE_INDEXES = (".qix", ".sbn", ".sbx", ".qpj", ".idm", ".ind", ".fbn", ".fbx", ".ain", ".aih", ".ixs")
 
-_NO_SPACE = (
-    {errno.ENOSPC, errno.EFBIG, errno.EDQUOT} if hasattr(errno, "EDQUOT") else {errno.ENOSPC, errno.EFBIG}
-)
+_NO_SPACE = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT} if hasattr(errno, "EDQUOT") else {errno.ENOSPC, errno.EFBIG}
 _TEMPORARY = re.compile(r"\.polymerge-(?P<host>[0-9a-f]{8})-(?P<pid>\d+)-")
 _FOREIGN_TEMPORARY_SECONDS = 7 * 24 * 3600
 

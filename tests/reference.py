@@ -210,9 +210,7 @@ def choose_base(polylines: list[Polyline], members: list[int]) -> int:
     return min(candidates, key=lambda i: (-length(polylines[i].points), polylines[i].key))
 
 
-def merge_order(
-    polylines: list[Polyline], members: list[int], base: int, edges: set[frozenset[int]]
-) -> list[int]:
+def merge_order(polylines: list[Polyline], members: list[int], base: int, edges: set[frozenset[int]]) -> list[int]:
     """Order in which the others are merged onto the base."""
     depths = steps_from(base, edges)
 

@@ -145,11 +145,14 @@ def _fit_times(column: Any, kind: str, where: str) -> Any:
 
 
 def _fit_integers(column: Any, kind: str, where: str) -> Any:
-    limit = 10**18 if kind == "ESRI Shapefile" else 2**63
+    """Keep whole numbers exact: what a dBase field cannot hold becomes text, what nothing can hold is refused."""
     held = column.dropna()
     low, high = (int(held.min()), int(held.max())) if len(held) else (0, 0)
-    if kind != "Parquet" and (high >= limit or low < -limit or (kind == "ESRI Shapefile" and low <= -(limit // 10))):
-        raise OutputError(f"{where}: {high if high >= limit else low} is too long a number for {kind}; make it text")
+    if kind == "ESRI Shapefile" and (high >= 10**18 or low <= -(10**17)):
+        warn(f"{where}: numbers of more than 18 digits are written as text")
+        return column.map(str, na_action="ignore").astype(object)
+    if kind != "Parquet" and high >= 2**63:
+        raise OutputError(f"{where}: {high} is too long a number for {kind}; make it text")
     return column
 
 

@@ -90,8 +90,8 @@ def source_files(source: str | os.PathLike[str]) -> list[Path]:
 
 
 def is_merged_map(file: Path) -> bool:
-    """Whether a file holds elements, which have ids of their own."""
-    return any(_ID_COLUMNS.intersection(layer.fields) for layer in list_layers(file))
+    """Whether a file is there and holds elements, which have ids of their own."""
+    return not _columns(file).isdisjoint(_ID_COLUMNS)
 
 
 def _companions(file: Path, layer: str | None) -> dict[str, Path]:
@@ -99,19 +99,22 @@ def _companions(file: Path, layer: str | None) -> dict[str, Path]:
     if not holds_one_layer(file):
         return {}
     areas = companion_path(file, AREAS_LAYER, ELEMENTS_LAYER)
-    if layer is None and areas.is_file() and is_merged_map(file) and is_merged_map(areas):
+    if layer is None and is_merged_map(areas) and is_merged_map(file):
         return {AREAS_LAYER: areas}
     instances, tables = companion_path(file, INSTANCES_LAYER, LOCAL_MAPS_LAYER), tables_beside(file)
-    if not instances.is_file() or not _LOCAL_MAP_COLUMNS <= _columns(file):
+    if not (_columns(instances).issuperset(_written_as(file)) and _columns(file).issuperset(_LOCAL_MAP_COLUMNS)):
         return {}
-    if not set(_written_as(file)) <= _columns(instances):
-        return {}
-    has_left_out = tables.is_file() and any(each.name == LEFT_OUT_TABLE for each in list_layers(tables))
+    has_left_out = any(each.name == LEFT_OUT_TABLE for each in _layers(tables))
     return {INSTANCES_LAYER: instances} | ({LEFT_OUT_TABLE: tables} if has_left_out else {})
 
 
 def _columns(file: Path) -> set[str]:
-    return {name for layer in list_layers(file) for name in layer.fields}
+    return {name for layer in _layers(file) for name in layer.fields}
+
+
+def _layers(file: Path) -> list[LayerInfo]:
+    # pathlib raises an error for a name that is too long; no such file can be there.
+    return list_layers(file) if os.path.isfile(file) else []  # noqa: PTH113
 
 
 def _written_as(file: Path) -> dict[str, str]:

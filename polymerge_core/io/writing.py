@@ -160,9 +160,7 @@ def _emptying_old_areas(
     """Add an empty layer of areas where an older map's areas would be taken for those of this map."""
     elements = layers.get(ELEMENTS_LAYER)
     areas = companion_path(Path(path), AREAS_LAYER, ELEMENTS_LAYER)
-    if AREAS_LAYER in layers or elements is None or "element_id" not in elements.columns:
-        return layers
-    if not holds_one_layer(areas) or not areas.is_file():
+    if AREAS_LAYER in layers or elements is None or "element_id" not in elements or not holds_one_layer(areas):
         return layers
     try:
         old = is_merged_map(areas)

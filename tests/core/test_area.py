@@ -79,10 +79,7 @@ def crossing_groups(draw):
     angle, skew = draw(st.floats(0, 180)), draw(st.floats(-1, 1))
     x, y = draw(st.floats(-100, 100)), draw(st.floats(-100, 100))
     shifts = draw(st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)), min_size=1, max_size=6))
-    return [
-        affinity.translate(crossing(length, width, skew=skew, angle=angle, shift=shift), x, y)
-        for shift in shifts
-    ]
+    return [affinity.translate(crossing(length, width, skew=skew, angle=angle, shift=shift), x, y) for shift in shifts]
 
 
 class TestCoverageGrid:

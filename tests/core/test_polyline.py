@@ -336,6 +336,16 @@ class TestLongBase:
         others = [np.column_stack((np.arange(1.0, 1199, 6), np.full(200, 10.0)))]
         assert_same_line(merge_polylines(comb, others), self.by_reference(comb, others))
 
+    @pytest.mark.parametrize("x", [588.5, 428.5, 308.5, 148.5, 28.5])
+    def test_tie_with_a_far_later_part_that_reaches_nearer_elsewhere(self, x):
+        # A long U whose way back, 20 m above, bulges towards the point 10 m beside it; both legs are 10 m away.
+        there = np.column_stack((np.arange(600.0), np.zeros(600)))
+        turn = np.column_stack((np.full(300, 700.0), np.linspace(0, 20, 300)))
+        back = np.column_stack((np.arange(599.0, -1, -1), np.where(np.arange(600) % 20 == 0, 15.0, 20.0)))
+        base = np.vstack((there, turn, back))
+        expected = np.insert(base, int(x) + 1, (x, 5), axis=0)
+        assert_same_line(merge_polylines(base, [np.array([(x, 10.0)])]), expected)
+
     def test_many_points_in_one_place(self, winding, rng):
         others = [winding[700] + rng.normal(0, 0.5, (400, 2))]
         assert_same_line(merge_polylines(winding, others), self.by_reference(winding, others))
