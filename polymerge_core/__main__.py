@@ -268,8 +268,10 @@ class _Run:
         """Stage the JSON report, or keep it until the end where it goes to standard output."""
         if self._report_file is None:
             return
-        text = json.dumps(content, indent=2, ensure_ascii=False, default=_plain) + "\n"
-        if self._report_file == "-":
+        # Standard output may be a terminal that knows few letters.
+        printed = self._report_file == "-"
+        text = json.dumps(content, indent=2, ensure_ascii=printed, default=_plain) + "\n"
+        if printed:
             self._printed = text
         else:
             self._outputs.stage(self._report_file).write_text(text, encoding="utf-8")

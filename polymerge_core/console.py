@@ -13,8 +13,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, Literal
 
 import click
@@ -39,8 +38,6 @@ class ProgressReport:
     ----------
     mode : {"auto", "json", "none"}
         ``auto`` draws a bar on a terminal and is silent elsewhere; ``json`` prints one object a line.
-    start, end : float
-        The part of the whole run that this report covers.
     """
 
     def __init__(self, mode: ProgressMode) -> None:
@@ -74,16 +71,6 @@ class ProgressReport:
         if self._bar is not None:
             self._bar.render_finish()
             self._bar = None
-
-
-@contextmanager
-def progress_report(mode: ProgressMode) -> Iterator[ProgressReport]:
-    """Show progress while the block runs."""
-    report = ProgressReport(mode)
-    try:
-        yield report
-    finally:
-        report.close()
 
 
 def watch_stdin() -> None:

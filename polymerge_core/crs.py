@@ -149,12 +149,17 @@ def check_coordinates(crs: pyproj.CRS, bounds: Bounds, where: str) -> None:
     Raises
     ------
     CrsError
-        If they are outside the CRS's area of use by more than `AREA_OF_USE_MARGIN_DEG`, or in degrees and
-        out of range, or on both sides of the antimeridian.
+        If the CRS has no plane coordinates, or they are outside its area of use by more than
+        `AREA_OF_USE_MARGIN_DEG`, or in degrees and out of range, or on both sides of the antimeridian.
     """
     if is_local(crs):
         return
     hint = "check the CRS and the order of the axes (x is easting or longitude)"
+    if not (crs.is_geographic or crs.is_projected):
+        raise CrsError(
+            f"{where}: {crs.name} ({crs.type_name}) has no longitude and latitude, or easting and northing, in which a "
+            "map is drawn; reproject the layer"
+        )
     if crs.is_geographic:
         xmin, ymin, xmax, ymax = bounds
         if ymin < -90 or ymax > 90 or xmin < -360 or xmax > 360:

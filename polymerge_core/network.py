@@ -7,7 +7,7 @@ connected components of the network are the sets that are merged into one elemen
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,12 @@ from polymerge_core.polyline import project_points
 
 #: Lines whose neighbours are looked for at once: bounds the memory where everything is near everything.
 _CHUNK = 512
+
+#: Lines of more vertices get an index of their segments.
+_SHORT = 64
+
+#: Vertices checked at once: a fraction of a second's work.
+_VERTICES = 1_000_000
 
 #: More pairs than this within the proximity are a mistake in the data or in the threshold (24 bytes each).
 MAX_EDGES = 30_000_000
@@ -105,9 +111,7 @@ def merge_edges(
     if len(lines) == 0:
         return Edges.none()
     tree = shapely.STRtree(lines)
-    vertices = shapely.extract_unique_points(lines)
-    # "At most the number just below" is "less than": the comparison of the paper is strict.
-    within = np.nextafter(proximity, 0.0)
+    check = _VertexCheck(lines, proximity)
     found = []
     count = 0
     for start in range(0, len(lines), _CHUNK):
@@ -115,16 +119,16 @@ def merge_edges(
         first, second = tree.query(_boxes(portion, proximity))
         first += start
         wanted = (first < second) & ~(is_main[first] & is_main[second])
-        first, second = first[wanted], second[wanted]
-        near = shapely.dwithin(vertices[first], lines[second], within)
-        near[~near] = shapely.dwithin(vertices[second[~near]], lines[first[~near]], within)
-        found.append((first[near], second[near]))
-        count += int(near.sum())
-        if count > MAX_EDGES:
-            raise InputError(
-                f"more than {MAX_EDGES:,} pairs of polylines are within {proximity:g} m of each other; "
-                "choose a smaller proximity or a higher min_score, or merge the data in parts"
-            )
+        for near in check.passing(first[wanted], second[wanted]):
+            found.append(near)
+            count += len(near[0])
+            if count > MAX_EDGES:
+                raise InputError(
+                    f"more than {MAX_EDGES:,} pairs of polylines are within {proximity:g} m of each other; "
+                    "choose a smaller proximity or a higher min_score, or merge the data in parts"
+                )
+            if advance is not None:
+                advance(0)
         if advance is not None:
             advance(len(portion))
     first, second = (np.concatenate(column) for column in zip(*found, strict=True))
@@ -132,8 +136,8 @@ def merge_edges(
     first, second = first[order], second[order]
     if not distances:
         return Edges(first, second, np.full(len(first), np.nan))
-    there = shapely.distance(vertices[first], lines[second])
-    back = shapely.distance(vertices[second], lines[first])
+    there = shapely.distance(lines[second], check.vertices[first])
+    back = shapely.distance(lines[first], check.vertices[second])
     return Edges(first, second, np.minimum(there, back))
 
 
@@ -194,6 +198,29 @@ def breadth_first_depth(count: int, edges: Edges, roots: NDArray[np.intp]) -> ND
     if not np.isfinite(depth).all():
         raise ValueError("a component of the network has no root")
     return depth.astype(np.intp) - 1
+
+
+class _VertexCheck:
+    """`polyline_merge_check` on arrays of pairs."""
+
+    def __init__(self, lines: NDArray[np.object_], proximity: float) -> None:
+        self.lines, self.vertices = lines, shapely.extract_unique_points(lines)
+        # "At most the number just below" is "less than": the comparison of the paper is strict.
+        self._within = np.nextafter(proximity, 0.0)
+        self._size = shapely.get_num_coordinates(lines)
+        # An index pays from here on; below, building it costs more than it saves.
+        shapely.prepare(lines[self._size > _SHORT])
+
+    def passing(
+        self, first: NDArray[np.intp], second: NDArray[np.intp]
+    ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """Yield the pairs that pass, in portions of bounded work, so that a run can be stopped between two."""
+        portion = np.cumsum(self._size[first] + self._size[second]) // _VERTICES
+        for rows in np.split(np.arange(len(first)), np.flatnonzero(np.diff(portion)) + 1):
+            one, other = first[rows], second[rows]
+            near = shapely.dwithin(self.lines[other], self.vertices[one], self._within)
+            near[~near] = shapely.dwithin(self.lines[one[~near]], self.vertices[other[~near]], self._within)
+            yield one[near], other[near]
 
 
 def _boxes(lines: NDArray[np.object_], margin: float) -> NDArray[np.object_]:

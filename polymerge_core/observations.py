@@ -107,6 +107,7 @@ def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], opti
     if is_local(out_crs) != is_local(work):
         raise CrsError("out_crs cannot be used: plain metric coordinates (crs=local) have no place on Earth")
     parts = _to_working_crs(parts, layer_crs, work)
+    _check_out_crs(parts, work, out_crs)
     _check_shapes(parts)
     _measure(parts)
     table, duplicates = canonical_order(parts[parts["reason"].isna()], attributes)
@@ -264,6 +265,22 @@ def _to_working_crs(parts: pd.DataFrame, layer_crs: list[pyproj.CRS], work: pypr
     moved = shapely.remove_repeated_points(moved, MIN_SEGMENT_M)
     cleaned = before - shapely.get_num_coordinates(moved)
     return parts.assign(shape=moved, original=original, cleaned=np.maximum(cleaned, 0))
+
+
+def _check_out_crs(parts: pd.DataFrame, work: pyproj.CRS, out_crs: pyproj.CRS) -> None:
+    """Refuse an output CRS in which the result would lie nowhere, or around the world."""
+    usable = parts.loc[parts["reason"].isna(), "shape"].to_numpy()
+    if work == out_crs or len(usable) == 0:
+        return
+    transformer = pyproj.Transformer.from_crs(work, out_crs, always_xy=True)
+    xmin, ymin, xmax, ymax = transformer.transform_bounds(*shapely.total_bounds(usable))
+    if not np.isfinite([xmin, ymin, xmax, ymax]).all():
+        raise CrsError(f"the result has no place in {out_crs.name}; choose another out_crs")
+    if xmin > xmax:
+        raise CrsError(
+            f"the result lies on both sides of the antimeridian, where {out_crs.name} ends; choose a projected out_crs"
+        )
+    check_coordinates(out_crs, (xmin, ymin, xmax, ymax), "the result")
 
 
 def _check_shapes(parts: pd.DataFrame) -> None:

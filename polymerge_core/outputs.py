@@ -287,9 +287,11 @@ def _check_place(target: Path) -> None:
 
 
 def _same_file(one: Path, other: Path) -> bool:
-    if one.exists() and other.exists():
-        return one.samefile(other)
-    return os.path.normcase(one) == os.path.normcase(other.resolve())
+    with contextlib.suppress(OSError, RuntimeError):  # a loop of links is no file, so it is not the same one
+        if one.exists() and other.exists():
+            return one.samefile(other)
+        return os.path.normcase(one) == os.path.normcase(other.resolve())
+    return False
 
 
 def _host() -> str:

@@ -171,11 +171,13 @@ def _line(points: Any, where: str) -> NDArray[np.float64]:
 def _fault(line: NDArray[np.float64], score: float) -> str | None:
     """Say why a vector cannot be an observation; None where it can."""
     if len(line) < 2:
-        return f"fewer than 2 points ({len(line)})"
+        return "fewer than 2 points"
     if not np.isfinite(line).all():
-        return "a coordinate is not finite"
-    if not 0.0 <= score <= 1.0:  # also where it is nan
-        return f"the score {score:g} is not within 0 and 1"
+        return "a coordinate is not a number"
+    if not np.isfinite(score):
+        return "the score is not a number"
+    if not 0.0 <= score <= 1.0:
+        return "the score is not between 0 and 1"
     return None
 
 

@@ -124,6 +124,8 @@ def _detect(file: Path) -> str:
         if head.startswith(magic):
             return kind
     if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
+        if re.search(rb'"(results|groundTruth)"\s*:', head) and b'"type"' not in head[:100]:
+            raise InputError(f"{file} holds a predictor's results, no layer: run project on it first")
         return "GeoJSON"
     raise InputError(
         f"{file} is not a GeoPackage, Shapefile, GeoJSON, FlatGeobuf or GeoParquet file, or its beginning is damaged"

@@ -60,8 +60,9 @@ def test_ten_copies_in_one_shapefile_give_one_line(run, tmp_path):
     road = look(tmp_path / "road.shp")
     assert road[["class", "n_obs", "n_inst", "id"]].to_numpy().tolist() == [["line", 10, 10, road["id"][0]]]
     assert road.crs == UTM
-    truth = np.column_stack([x := np.linspace(0, 60, 400), 10 * np.sin(x / 15)]) + (EAST, NORTH)
-    assert shapely.hausdorff_distance(road.geometry[0], LineString(truth)) < 1.0
+    x = np.linspace(0, 60, 400)
+    truth = shapely.linestrings(EAST + x, NORTH + 10 * np.sin(x / 15))
+    assert shapely.hausdorff_distance(road.geometry[0], truth) < 1.0
 
 
 def test_ten_shapefiles_with_one_copy_each_give_the_same_line(run, tmp_path):
@@ -250,7 +251,9 @@ def test_layers_in_different_crs_meet_in_the_first_one(run, tmp_path):
     assert run("merge", one, other, "-o", tmp_path / "out.gpkg").code == 0
     merged = look(tmp_path / "out.gpkg", "elements")
     assert merged.crs == UTM
-    assert np.allclose(coordinates(merged)[0], np.add([[0, 0], [1, 0.25], [29, 0.25], [30, 0]], (EAST, NORTH)), atol=1e-6)
+    assert np.allclose(
+        coordinates(merged)[0], np.add([[0, 0], [1, 0.25], [29, 0.25], [30, 0]], (EAST, NORTH)), atol=1e-6
+    )
 
 
 # -- reports and progress --------------------------------------------------------------------------
@@ -265,6 +268,13 @@ def test_a_report_on_standard_output_is_json_and_nothing_else(run, tmp_path, com
     assert report["observations"] == 4
     assert report["left_out"] == {"no geometry": 1}
     assert "1 left out (no geometry: 1)" in outcome.err
+
+
+def test_a_report_on_standard_output_needs_no_letters_that_a_terminal_may_lack(run, tmp_path):
+    road = draw(tmp_path / "road.gpkg", [line((0, 0), (9, 0))], **{"class": ["Straße"]})
+    outcome = run("merge", road, "--json", "-", "-o", tmp_path / "out.gpkg")
+    assert outcome.out.isascii()
+    assert list(json.loads(outcome.out)["classes"]) == ["Straße"]
 
 
 def test_a_report_goes_to_a_file(run, tmp_path):
@@ -359,10 +369,7 @@ def test_every_format_brings_the_same_layer(run, tmp_path, extension):
     outcome = run("merge", source, "-o", tmp_path / "out.gpkg")
     assert outcome.code == 0, outcome.err
     merged = look(tmp_path / "out.gpkg", "elements")
-    expected = [[[0, 0], [1, 0.265625], [8, 0.4375], [15, 0.390625], [16, 0]], [[0, 64], [8, 64]]]
     assert merged["class"].tolist() == ["a", "b"]
-    assert [(np.array(each) - (EAST, NORTH)).round(9).tolist()[0] for each in coordinates(merged)] == [[0, 0], [0, 64]]
-    assert len(coordinates(merged)[0]) == len(expected[0])
     assert coordinates(merged) == coordinates(_reference(run, tmp_path))
     assert merged.crs == UTM
 

@@ -116,6 +116,33 @@ BAD = {
         1,
         ["out_crs", "crs=local"],
     ),
+    "an output CRS of another continent": (
+        lambda f: merge(f.layer(), "--out-crs", "EPSG:32755"),
+        1,
+        ["the result", "far from", "UTM zone 55S"],
+    ),
+    "a main map on another continent": (
+        lambda f: merge(f.layer(geometries=[PAIR[0]], crs="EPSG:32755"), "--main-map", f.layer("map.gpkg")),
+        1,
+        ["the result", "far from", "UTM zone 32N"],
+    ),
+    "an output CRS that ends in the middle of the data": (
+        lambda f: merge(
+            f.layer(geometries=[LineString([(3_324_000, 0), (3_364_000, 0)])], crs=3832), "--out-crs", "EPSG:4326"
+        ),
+        1,
+        ["the result", "both sides of the antimeridian", "a projected out_crs"],
+    ),
+    "an output CRS that is no plane": (
+        lambda f: merge(f.layer(), "--out-crs", "EPSG:4978"),
+        1,
+        ["the result", "Geocentric CRS", "easting and northing"],
+    ),
+    "coordinates from the middle of the Earth": (
+        lambda f: merge(f.layer("roads.parquet", crs=4978)),
+        1,
+        ["layer 'roads'", "Geocentric CRS", "reproject the layer"],
+    ),
     # columns
     "a named class column that is absent": (
         lambda f: merge(f.layer(), "--class-field", "klass"),
@@ -611,7 +638,9 @@ def test_an_existing_output_is_refused_then_replaced(run, tmp_path, command):
 
 def test_an_existing_report_is_refused(run, tmp_path):
     (tmp_path / "r.json").write_bytes(OLD)
-    outcome = run("merge", draw(tmp_path / "roads.gpkg", PAIR), "-o", tmp_path / "out.gpkg", "--json", tmp_path / "r.json")
+    outcome = run(
+        "merge", draw(tmp_path / "roads.gpkg", PAIR), "-o", tmp_path / "out.gpkg", "--json", tmp_path / "r.json"
+    )
     _assert_one_error(outcome, 1, "r.json exists", "--overwrite")
     assert not (tmp_path / "out.gpkg").exists()
 
@@ -694,12 +723,14 @@ def test_a_file_that_another_process_has_locked(run, tmp_path):
     assert run("merge", roads, "-o", tmp_path / "out.gpkg").code == 0
 
 
-@pytest.mark.parametrize("extension", ["gpkg", "parquet"])
+@pytest.mark.parametrize("extension", ["gpkg", "shp", "parquet"])
 def test_a_full_disk_leaves_the_old_output_whole(run_alone, tmp_path, extension):
     inputs, outputs = tmp_path / "in", tmp_path / "out"
     inputs.mkdir()
     outputs.mkdir()
-    roads = draw(inputs / "roads.gpkg", noisy_copies(30, 2000)[:, None].ravel(), **{"class": [f"c{n}" for n in range(30)]})
+    roads = draw(
+        inputs / "roads.gpkg", noisy_copies(30, 2000)[:, None].ravel(), **{"class": [f"c{n}" for n in range(30)]}
+    )
     out = outputs / f"map.{extension}"
     out.write_bytes(OLD)
 

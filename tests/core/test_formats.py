@@ -223,10 +223,10 @@ def test_a_number_without_a_name_is_an_error(write, build, label):
 @pytest.mark.parametrize(
     ("vector", "score", "reason", "length"),
     [
-        ([[0.0, 0.0], [float("nan"), 1.0]], 0.9, "not finite", np.nan),
-        ([[0.0, 0.0], [float("inf"), float("inf")], [float("inf"), 1.0]], 0.9, "not finite", np.nan),
-        ([[0.0, 0.0], [None, 1.0]], 0.9, "not finite", np.nan),
-        ([[0.0, 0.0], [10**400, 1.0]], 0.9, "not finite", np.nan),
+        ([[0.0, 0.0], [float("nan"), 1.0]], 0.9, "a coordinate is not a number", np.nan),
+        ([[0.0, 0.0], [float("inf"), float("inf")], [float("inf"), 1.0]], 0.9, "a coordinate is not a number", np.nan),
+        ([[0.0, 0.0], [None, 1.0]], 0.9, "a coordinate is not a number", np.nan),
+        ([[0.0, 0.0], [10**400, 1.0]], 0.9, "a coordinate is not a number", np.nan),
         ([], 0.9, "fewer than 2 points", 0.0),
         ([[1.0, 1.0]], 0.9, "fewer than 2 points", 0.0),
         ([[0.0, 0.0], [3.0, 4.0]], float("nan"), "score", 5.0),

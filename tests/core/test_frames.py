@@ -409,14 +409,14 @@ def test_a_projected_crs_in_feet_gets_feet():
 
 def test_vectors_left_out_by_the_reader_are_listed():
     lost = (
-        LeftOutVector("0", 3, 5.0, "fewer than 2 points (1)"),
-        LeftOutVector("0", 4, np.nan, "not finite"),
+        LeftOutVector("0", 3, 5.0, "fewer than 2 points"),
+        LeftOutVector("0", 4, np.nan, "a coordinate is not a number"),
     )
     maps = project(seen(LEFT_10, left_out=lost), at((0, 0)), crs="local", drive="tuesday")
     assert maps.left_out.columns.tolist() == list(LEFT_OUT_COLUMNS)
     assert maps.left_out.iloc[0].to_dict() == {
         "source": "drive", "source_fid": 3, "drive": "tuesday", "instance": "0",
-        "from_m": 0.0, "to_m": 5.0, "reason": "fewer than 2 points (1)",
+        "from_m": 0.0, "to_m": 5.0, "reason": "fewer than 2 points",
     }  # fmt: skip
 
 
