@@ -66,6 +66,9 @@ _reading_options = _decorate(
     click.option("--proximity", type=float, default=1.0, show_default=True, help="Th_prox in metres."),
     click.option("--area", multiple=True, metavar="CLASS", help="A class of areas, beside ped_crossing; repeatable."),
     click.option("--crs", callback=_known_crs, help="CRS of layers without one, such as EPSG:32632, or local."),
+    click.option(
+        "--out-crs", callback=_known_crs, help="CRS of the result.  [default: the main map's, else the first layer's]"
+    ),
     click.option("--strict", is_flag=True, help="A feature that cannot be used is an error."),
 )
 
@@ -134,9 +137,6 @@ def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None
     multiple=True,
     metavar="[COLUMN=]FUNCTION",
     help=f"How columns are carried: {', '.join(AGGREGATES)}; repeatable.  [default: first]",
-)
-@click.option(
-    "--out-crs", callback=_known_crs, help="CRS of the result.  [default: the main map's, else the first layer's]"
 )
 @_output
 @_run_options

@@ -124,8 +124,7 @@ class _Batch:
         """Return the nearest segment of each base, the parameter and the foot there (eq. 2)."""
         active = points.shape[1]
         held = self.base[:, :active, :width]
-        with np.errstate(invalid="ignore"):  # the unused rest of a row has segments of no length
-            parameter, foot, squared = feet(points[:, :, np.newaxis], held[:, :, :-1], held[:, :, 1:])
+        parameter, foot, squared = feet(points[:, :, np.newaxis], held[:, :, :-1], held[:, :, 1:])
         squared[np.arange(width - 1) >= self.size[:active, np.newaxis] - 1] = np.inf
         segment = squared.argmin(axis=1)
         row = np.arange(active)

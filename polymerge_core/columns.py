@@ -68,7 +68,7 @@ def read_columns(layers: Sequence[Layer], options: Options) -> tuple[pd.DataFram
     SchemaError
         If a named column is missing, or a column cannot be what it is named for.
     """
-    count = sum(not layer.is_main for layer in layers)
+    count = sum(not layer.is_main and not layer.data.empty for layer in layers)
     notes: dict[str, Any] = {"instance_from": {}, "warnings": []}
     features, attributes = [], []
     for number, layer in enumerate(layers):
@@ -77,10 +77,11 @@ def read_columns(layers: Sequence[Layer], options: Options) -> tuple[pd.DataFram
             notes["warnings"].append(f"{layer.where} holds no features")
         table, used = _features(layer, options, several=count > 1, notes=notes)
         features.append(table.assign(layer=number))
-        attributes.append(_user_columns(layer, used))
+        attributes.append(_user_columns(layer, used, notes))
     merged = pd.concat(features, ignore_index=True)
     _check_ids(merged.loc[merged["main_id"] >= 0, ["source", "main_id"]])
     _note_classes_alike(merged["class"], notes)
+    _note_missing_class(merged, notes)
     return merged, _join_attributes(attributes, notes), notes
 
 
@@ -110,6 +111,7 @@ def _features(layer: Layer, options: Options, *, several: bool, notes: dict[str,
     )
     table["shape"] = table["shape"].astype(object)
     table["class"] = _read_class(find, options, table)
+    table["has_class"] = "class" in find.understood
     table["drive"] = _read_text(find("drive", options.drive_field), default=source)
     _read_instance(find, layer, options, table, several=several, notes=notes)
     _read_score(find, options, table)
@@ -125,7 +127,9 @@ class _Finder:
 
     def __init__(self, layer: Layer, options: Options) -> None:
         self.layer, self.options = layer, options
+        #: Columns of the layer that were understood, and what each was understood as.
         self.used: set[str] = set()
+        self.understood: set[str] = set()
 
     def __call__(self, default: str, name: str | None) -> pd.Series | None:
         data = self.layer.data
@@ -137,6 +141,7 @@ class _Finder:
         if found is None:
             return None
         self.used.add(found)
+        self.understood.add(default)
         return pd.Series(data[found].to_numpy(), dtype=data[found].dtype, name=found)
 
 
@@ -171,7 +176,15 @@ def _read_instance(
     elif rule == "layer":
         table["instance"] = layer.maps.source
     else:
-        table["instance"] = table["source_fid"].astype(str)
+        # The index of a GeoDataFrame need not be unique; a look is one feature all the same.
+        again = table.groupby("source_fid").cumcount()
+        table["instance"] = pd.Series(
+            [
+                f"{fid} ({count + 1})" if count else str(fid)
+                for fid, count in zip(table["source_fid"], again, strict=True)
+            ],
+            dtype=object,
+        )
     table["instance_kind"] = rule
     if not layer.is_main:
         notes["instance_from"][layer.maps.source] = rule
@@ -187,6 +200,11 @@ def _read_score(find: _Finder, options: Options, table: pd.DataFrame) -> None:
     if find.layer.is_main:
         table["score"] = np.where(np.isfinite(score), score, 1.0)
         return
+    if len(score) and not ((score >= 0) & (score <= 1)).any():
+        raise SchemaError(
+            f"{find.layer.where}: the column {column.name!r} holds no scores, which are between 0 and 1; "
+            "name another column with score_field"
+        )
     _leave_out(table, ~np.isfinite(score), "the score is not a number")
     _leave_out(table, (score < 0) | (score > 1), "the score is not between 0 and 1")
     _leave_out(table, score < options.min_score, f"the score is under min_score ({options.min_score:g})")
@@ -230,7 +248,8 @@ def _not_a_timestamp(unfit: pd.Series, where: str) -> SchemaError:
 
 def _read_main(find: _Finder, layer: Layer, table: pd.DataFrame) -> None:
     """Read what a map says of its own elements: ids, and how many observations and instances they stand for."""
-    table["main_id"], table["weight"], table["looks"] = -1, 1, 1
+    # No looks: the local map, or the main map as a whole, counts as one.
+    table["main_id"], table["weight"], table["looks"] = -1, 1, 0
     if not layer.is_main:
         return
     ids = find("element_id", None)
@@ -256,9 +275,14 @@ def _check_ids(known: pd.DataFrame) -> None:
         raise SchemaError(f"main map {source!r}: element_id {number} occurs more than once; ids must be unique")
 
 
-def _user_columns(layer: Layer, used: set[str]) -> pd.DataFrame:
+def _user_columns(layer: Layer, used: set[str], notes: dict[str, Any]) -> pd.DataFrame:
     """Return the columns that are the user's own."""
     ours = {name.lower() for name in ELEMENT_COLUMNS}
+    written_anew = [str(name) for name in layer.data.columns if str(name).lower() in ours and name not in used]
+    if written_anew and not layer.is_main:
+        notes["warnings"].append(
+            f"{layer.where}: the result has its own columns of the names {', '.join(written_anew)}"
+        )
     columns = [
         column
         for column in layer.data.columns
@@ -302,6 +326,17 @@ def _note_classes_alike(classes: pd.Series, notes: dict[str, Any]) -> None:
     for alike in folded.values():
         if len(alike) > 1:
             notes["warnings"].append(f"the classes {', '.join(map(repr, alike))} are not merged with each other")
+
+
+def _note_missing_class(features: pd.DataFrame, notes: dict[str, Any]) -> None:
+    named = features.groupby("source", sort=True)["has_class"].first()
+    if named.any() and not named.all():
+        without = ", ".join(repr(source) for source in named[~named].index)
+        default = features.loc[~features["has_class"], "class"].iloc[0]
+        notes["warnings"].append(
+            f"{without} has no class column, so its features are of class {default!r} and merge with no other class; "
+            "class_name names the class they are of"
+        )
 
 
 def _read_text(column: pd.Series | None, *, default: str) -> pd.Series | str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from polymerge_core.errors import OutputError
 from polymerge_core.figures import before_after
 from polymerge_core.formats import read_poses, read_predictions
 from polymerge_core.frames import project
@@ -49,7 +50,10 @@ def run_demo(folder: Path, *, overwrite: bool = False) -> str:
         If an output exists already, or cannot be written.
     """
     sample = sample_folder()
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be made: {error.strerror}; name another folder") from error
     targets = [folder / name for name in ("local_maps.gpkg", "merged.gpkg", "before_after.png")]
     with StagedOutputs(overwrite=overwrite) as outputs:
         outputs.check(targets)

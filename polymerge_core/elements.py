@@ -11,11 +11,10 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from polymerge_core.crs import transform_coordinates
 from polymerge_core.errors import OptionError
 from polymerge_core.observations import Observations, as_lines
 from polymerge_core.options import Options
-from polymerge_core.schema import LINEAGE_COLUMNS
+from polymerge_core.schema import ALIAS_COLUMNS, LINEAGE_COLUMNS
 from polymerge_core.sets import ElementSets
 
 
@@ -45,7 +44,7 @@ def build_elements(
         `old_id`, `element_id` of the main map's ids that are no more.
     """
     table, component, base = observations.table, sets.component, sets.base
-    ids, aliases = _assign_ids(table, component, base, shapes)
+    ids, aliases = _assign_ids(table, sets, shapes, observations.id_aliases)
     weight = table["weight"].to_numpy(dtype=float)
     total = np.bincount(component, weight, len(base))
     columns = {
@@ -87,9 +86,13 @@ def build_lineage(observations: Observations, sets: ElementSets, ids: NDArray[np
 
 
 def _assign_ids(
-    table: pd.DataFrame, component: NDArray[np.intp], base: NDArray[np.intp], shapes: NDArray[np.object_]
+    table: pd.DataFrame, sets: ElementSets, shapes: NDArray[np.object_], earlier: pd.DataFrame
 ) -> tuple[NDArray[np.int64], pd.DataFrame]:
-    """Keep the smallest id of the main map in each component; number the rest in canonical order."""
+    """Keep the smallest id of the main map in each component; number the rest in canonical order.
+
+    An id that once meant another element is never given again, and what became of it stays on record.
+    """
+    component, base = sets.component, sets.base
     known = pd.DataFrame({"old_id": table["main_id"], "component": component})
     # The parts of one multi-part element share its id; only the first keeps it.
     known = known[known["old_id"] >= 0].drop_duplicates("old_id")
@@ -100,18 +103,22 @@ def _assign_ids(
     _, key = np.unique(shapely.to_wkb(shapely.normalize(shapes[fresh])), return_inverse=True)
     _, name = np.unique(table["class"].to_numpy(dtype=str)[base[fresh]], return_inverse=True)
     order = fresh[np.lexsort((base[fresh], key, name))]
-    highest = int(known["old_id"].max()) if len(known) else 0
-    ids[order] = highest + 1 + np.arange(len(order))
+    used = [*known["old_id"], *earlier["old_id"], *earlier["element_id"]]
+    ids[order] = max(used, default=0) + 1 + np.arange(len(order))
     aliases = known.assign(element_id=ids[known["component"]])
-    aliases = aliases.loc[aliases["old_id"] != aliases["element_id"], ["old_id", "element_id"]]
-    return ids, aliases.astype(np.int64).sort_values("old_id").reset_index(drop=True)
+    aliases = aliases.loc[aliases["old_id"] != aliases["element_id"], list(ALIAS_COLUMNS)]
+    now = dict(zip(aliases["old_id"], aliases["element_id"], strict=True))
+    followed = earlier.assign(element_id=earlier["element_id"].map(lambda old: now.get(old, old)))
+    aliases = pd.concat([aliases, followed]).astype(np.int64).drop_duplicates("old_id")
+    return ids, aliases.sort_values("old_id").reset_index(drop=True)
 
 
 def _count_instances(table: pd.DataFrame, component: NDArray[np.intp], count: int) -> NDArray[np.int64]:
-    """Count the local maps in each component; a main map's element brings its own count."""
+    """Count the local maps in each component; a main map's element brings its own count, or the map counts once."""
     seen = pd.DataFrame({"component": component, "group": table["group"], "looks": table["looks"]})
-    distinct = seen[seen["group"] >= 0].drop_duplicates(["component", "group"])
-    looks = seen[seen["group"] < 0]
+    counted = seen["looks"] > 0
+    distinct = seen[~counted].drop_duplicates(["component", "group"])
+    looks = seen[counted]
     local = np.bincount(distinct["component"], minlength=count)
     return (local + np.bincount(looks["component"], looks["looks"], count)).astype(np.int64)
 
@@ -155,7 +162,7 @@ def _aggregate(values: pd.Series[Any], component: NDArray[np.intp], function: st
         return groups.sum(min_count=1)  # the sum of nothing is not 0
     try:
         return groups.agg(function)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise OptionError(
             f"aggregate cannot take the {function} of {values.name!r}: some of its values cannot be compared"
         ) from error
@@ -175,11 +182,9 @@ def _output_geometry(
     observations: Observations, component: NDArray[np.intp], base: NDArray[np.intp], shapes: NDArray[np.object_]
 ) -> NDArray[np.object_]:
     """Carry shapes to the output CRS; what nothing was merged into comes out bit for bit as it came in."""
-    table, work, out = observations.table, observations.crs, observations.out_crs
-    geometry = shapes.copy()
-    if work != out:
-        geometry = shapely.transform(geometry, lambda xy: transform_coordinates(xy, work, out))
-    same_crs = np.array([crs == out for crs in observations.layer_crs], dtype=bool)
+    table = observations.table
+    geometry = observations.to_output(shapes)
+    same_crs = np.array([crs == observations.out_crs for crs in observations.layer_crs], dtype=bool)
     alone = np.bincount(component, minlength=len(base)) == 1
     untouched = alone & same_crs[table["layer"].to_numpy()[base]] if len(base) else alone
     geometry[untouched] = table["original"].to_numpy()[base[untouched]]

@@ -267,7 +267,8 @@ def _first_rows(keys: NDArray[np.object_], wanted: NDArray[np.object_]) -> NDArr
 def _needed(poses: Poses, name: str, pose_kind: str) -> Array:
     value: Array | None = getattr(poses, name)
     if value is None:
-        raise InputError(f"{poses.source}: the poses have no {name}, which pose_kind={pose_kind} needs")
+        hint = "; they are latitudes and longitudes: give pose_kind=geodetic" if poses.lat is not None else ""
+        raise InputError(f"{poses.source}: the poses have no {name}, which pose_kind={pose_kind} needs{hint}")
     return value
 
 
@@ -283,8 +284,10 @@ def _check_options(
     if pose_kind not in get_args(PoseKind):
         raise OptionError(f"pose_kind cannot be {pose_kind!r}; it is one of {', '.join(get_args(PoseKind))}")
     for name, pair, kind in (("origin", origin, "origin"), ("pose_offset", pose_offset, "offset")):
-        if (pair is None) == (pose_kind == kind):
-            raise OptionError(f"{name} must be given with pose_kind={kind}, and only with it")
+        if pair is None and pose_kind == kind:
+            raise OptionError(f"pose_kind={kind} needs {name}: give it too")
+        if pair is not None and pose_kind != kind:
+            raise OptionError(f"{name} goes with pose_kind={kind}, not with pose_kind={pose_kind}")
         if pair is not None and not (np.shape(pair) == (2,) and np.isfinite(pair).all()):
             raise OptionError(f"{name} cannot be {pair!r}; it is two numbers")
     if origin is not None and not (abs(origin[0]) <= 90.0 and abs(origin[1]) <= 360.0):

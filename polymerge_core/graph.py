@@ -37,7 +37,7 @@ def merge_network(
     -------
     networkx.Graph
         A node for each observation, in canonical order, with `source`, `source_fid`, `drive`, `instance`, `class`,
-        `is_main`, `component` (number of the set that becomes one element) and `geometry` (in the CRS
+        `is_main`, `component` (number of the set that becomes one element) and `geometry` (in the output CRS,
         ``graph.graph["crs"]``); an edge for each pair to be merged, with its `distance` in metres.
 
     Raises
@@ -49,8 +49,9 @@ def merge_network(
     observations, edges = network.observations, network.edges
     table = observations.table
     columns = ["source", "source_fid", "drive", "instance", "class", "is_main"]
-    nodes = table[columns].assign(component=network.component, geometry=table["shape"])
-    graph = nx.Graph(crs=observations.crs, left_out=observations.left_out)
+    geometry = observations.to_output(table["shape"].to_numpy())
+    nodes = table[columns].assign(component=network.component, geometry=geometry)
+    graph = nx.Graph(crs=observations.out_crs, left_out=observations.left_out)
     graph.add_nodes_from(zip(range(len(nodes)), nodes.to_dict("records"), strict=True))
     pairs = zip(edges.first.tolist(), edges.second.tolist(), edges.distance.tolist(), strict=True)
     graph.add_weighted_edges_from(pairs, weight="distance")

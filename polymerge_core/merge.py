@@ -25,10 +25,12 @@ from polymerge_core.observations import Observations
 from polymerge_core.options import Options
 from polymerge_core.schema import (
     ALIASES_TABLE,
+    AREA_CLASSES,
     AREAS_LAYER,
     ELEMENTS_LAYER,
     LEFT_OUT_TABLE,
     LINEAGE_TABLE,
+    LocalMaps,
 )
 from polymerge_core.sets import ElementSets, Input, Progress, find_network, order_sets
 
@@ -57,6 +59,10 @@ class MergeResult:
     left_out: pd.DataFrame
     id_aliases: pd.DataFrame
     report: dict[str, Any]
+
+    def as_main_map(self) -> LocalMaps:
+        """Return the map as the main map of another merge, which then gives no id to two elements."""
+        return LocalMaps(self.elements, source="main_map", id_aliases=self.id_aliases)
 
     def layers(self) -> dict[str, pd.DataFrame]:
         """Return what there is by layer name, ready for `polymerge_core.write_layers`.
@@ -263,6 +269,14 @@ def _report(
         for name, rows in table.groupby("class", sort=True)
     }
     warnings = list(observations.notes["warnings"])
+    several = np.diff(sets.bounds) > 1
+    kinds = table.loc[sets.base[several], ["is_area", "class"]]
+    drawn = kinds.loc[kinds["is_area"] & ~kinds["class"].isin(AREA_CLASSES), "class"]
+    if len(drawn):
+        warnings.append(
+            f"{len(drawn)} merged areas of class {', '.join(sorted(map(repr, drawn.unique())))} became rectangles, as "
+            f"method={options.method} makes of every area"
+        )
     if lowered:
         warnings.append(
             f"{lowered} areas have no place that {options.coverage:.0%} of their observations cover; "

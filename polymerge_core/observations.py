@@ -22,7 +22,7 @@ from polymerge_core.crs import check_coordinates, is_local, parse_crs, transform
 from polymerge_core.errors import CrsError, InputError
 from polymerge_core.options import Options
 from polymerge_core.ordering import canonical_order
-from polymerge_core.schema import LEFT_OUT_COLUMNS, LINE_CLASSES, LocalMaps
+from polymerge_core.schema import ALIAS_COLUMNS, LEFT_OUT_COLUMNS, LINE_CLASSES, LocalMaps, empty_table
 
 #: Vertices nearer than this to the one before (metres) are the same vertex: no map is finer.
 MIN_SEGMENT_M = 1e-9
@@ -52,6 +52,8 @@ class Observations:
         Where the work happens, and the CRS of the output.
     layer_crs : list of pyproj.CRS
         CRS of each layer, by the number in ``table["layer"]``.
+    id_aliases : DataFrame
+        What became of ids of the main map in earlier merges: `old_id`, `element_id`.
     notes : dict
         What the report says about reading: instance rule, counts of what was cleaned, warnings.
     """
@@ -62,12 +64,22 @@ class Observations:
     crs: pyproj.CRS
     out_crs: pyproj.CRS
     layer_crs: list[pyproj.CRS]
+    id_aliases: pd.DataFrame
     notes: dict[str, Any] = field(default_factory=dict)
 
     @property
     def lines(self) -> NDArray[np.object_]:
         """Each observation as a line: itself, or an area's outer ring."""
         return as_lines(self.table["shape"].to_numpy())
+
+    def to_output(self, shapes: NDArray[np.object_]) -> NDArray[np.object_]:
+        """Carry shapes from the working CRS to the output CRS."""
+        if self.crs == self.out_crs:
+            return shapes.copy()
+        moved: NDArray[np.object_] = shapely.transform(
+            shapes, lambda xy: transform_coordinates(xy, self.crs, self.out_crs)
+        )
+        return moved
 
 
 def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], options: Options) -> Observations:
@@ -120,7 +132,11 @@ def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], opti
         )
     notes["cleaned_vertices"] = int(parts["cleaned"].sum())
     attributes = attributes.iloc[table["feature"]].reset_index(drop=True)
-    return Observations(table, attributes, left_out, work, out_crs, layer_crs, notes)
+    if is_local(work):
+        _note_like_degrees(table, notes)
+    known = [maps.id_aliases[list(ALIAS_COLUMNS)] for maps in main_map if maps.id_aliases is not None]
+    aliases = pd.concat([empty_table(ALIAS_COLUMNS), *known], ignore_index=True)
+    return Observations(table, attributes, left_out, work, out_crs, layer_crs, aliases, notes)
 
 
 def as_lines(shapes: NDArray[np.object_]) -> NDArray[np.object_]:
@@ -136,22 +152,23 @@ def _explode(features: pd.DataFrame) -> pd.DataFrame:
     features = features.assign(feature=np.arange(len(features)))
     shapes = features["shape"].to_numpy()
     reason = features["reason"].to_numpy(dtype=object, copy=True)
-    _give(reason, shapely.is_missing(shapes), "no geometry")
-    _give(reason, shapely.is_empty(shapes), "empty geometry")
     coordinates, owner = shapely.get_coordinates(shapes, return_index=True)
-    _give(reason, _any_of(owner[~np.isfinite(coordinates).all(axis=1)], len(shapes)), "a coordinate is not a number")
-    _give(
-        reason,
-        _any_of(owner[(np.abs(coordinates) > MAX_COORDINATE).any(axis=1)], len(shapes)),
-        "a coordinate is too large",
-    )
+    unfit = {
+        "no geometry": shapely.is_missing(shapes),
+        "empty geometry": shapely.is_empty(shapes),
+        "a coordinate is not a number": _any_of(owner[~np.isfinite(coordinates).all(axis=1)], len(shapes)),
+        "a coordinate is too large": _any_of(owner[(np.abs(coordinates) > MAX_COORDINATE).any(axis=1)], len(shapes)),
+    }
+    for text, chosen in unfit.items():
+        _give(reason, chosen, text)
     features["reason"] = reason
-    usable = np.flatnonzero(pd.isna(reason))
-    geometry, row = shapely.force_2d(shapes[usable]), usable
+    # What is left out for its columns keeps its shape: its length is accounted for like any other.
+    shapeless = np.logical_or.reduce(list(unfit.values()))
+    row, left = np.flatnonzero(~shapeless), np.flatnonzero(shapeless)
+    geometry = shapely.force_2d(shapes[row])
     while (shapely.get_type_id(geometry) >= _FIRST_MULTI).any():
         geometry, part = shapely.get_parts(geometry, return_index=True)
         row = row[part]
-    left = np.flatnonzero(pd.notna(reason))
     parts = features.iloc[np.concatenate([row, left])].copy()
     parts["shape"] = np.concatenate([geometry, np.full(len(left), None)])
     parts = parts.iloc[np.argsort(parts["feature"], kind="stable")].reset_index(drop=True)
@@ -184,7 +201,8 @@ def _polygons_to_rings(parts: pd.DataFrame, chosen: NDArray[np.bool_]) -> pd.Dat
 
 def _lines_to_polygons(parts: pd.DataFrame) -> None:
     """Close the lines of area classes, in place; two vertices enclose nothing."""
-    rows = np.flatnonzero(parts["is_area"] & ~parts["as_polygon"] & parts["reason"].isna())
+    kind = shapely.get_type_id(parts["shape"].to_numpy())
+    rows = np.flatnonzero(parts["is_area"] & np.isin(kind, _LINES))
     lines = shapely.remove_repeated_points(parts["shape"].to_numpy()[rows], 0.0)
     distinct = shapely.get_num_coordinates(lines) - shapely.is_closed(lines)
     _exclude(parts, _any_of(rows[distinct < 3], len(parts)), "an open line of two vertices encloses no area")
@@ -255,12 +273,11 @@ def _to_working_crs(parts: pd.DataFrame, layer_crs: list[pyproj.CRS], work: pypr
     before = shapely.get_num_coordinates(shapes)
     original = shapely.remove_repeated_points(shapes, 0.0)
     moved = original.copy()
-    for number, rows in parts[parts["reason"].isna()].groupby("layer").indices.items():
-        index = np.flatnonzero(parts["reason"].isna())[rows]
+    for (number, used), rows in parts.assign(used=parts["reason"].isna()).groupby(["layer", "used"]).indices.items():
         source = layer_crs[int(number)]
-        if source != work:
-            moved[index] = shapely.transform(
-                moved[index], lambda xy, source=source: transform_coordinates(xy, source, work)
+        if used or is_local(source) == is_local(work):
+            moved[rows] = shapely.transform(
+                moved[rows], lambda xy, source=source, used=used: transform_coordinates(xy, source, work, check=used)
             )
     moved = shapely.remove_repeated_points(moved, MIN_SEGMENT_M)
     cleaned = before - shapely.get_num_coordinates(moved)
@@ -299,6 +316,19 @@ def _measure(parts: pd.DataFrame) -> None:
     parts["length_m"] = np.where(np.isfinite(length), length, 0.0)
     parts["to_m"] = parts.groupby("feature")["length_m"].cumsum()
     parts["from_m"] = parts["to_m"] - parts["length_m"]
+
+
+def _note_like_degrees(table: pd.DataFrame, notes: dict[str, Any]) -> None:
+    """Say when plain coordinates look like degrees: a proximity of a metre would be a hundred kilometres."""
+    if table.empty:
+        return
+    shapes = table["shape"].to_numpy()
+    xmin, ymin, xmax, ymax = shapely.total_bounds(shapes)
+    step = table["length_m"].sum() / np.maximum(shapely.get_num_coordinates(shapes).sum() - len(shapes), 1)
+    if max(-xmin, xmax) <= 180 and max(-ymin, ymax) <= 90 and step < 0.01:
+        notes["warnings"].append(
+            "crs=local takes coordinates for metres, but these look like degrees; give their CRS, such as EPSG:4326"
+        )
 
 
 def _left_out(parts: pd.DataFrame, local_maps: list[LocalMaps]) -> pd.DataFrame:

@@ -62,8 +62,10 @@ def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     ['a3', 'b2', 'b10']
     """
     pieces = [piece for piece in _DIGITS.split(text) if piece]
+    # A number is its length without zeros in front, then its digits: as int() would order it, at any length.
+    keys = ((0, len(piece.lstrip("0")), piece.lstrip("0")) if piece.isdecimal() else (1, 0, piece) for piece in pieces)
     # The text itself comes last, so that "01" and "1" differ; the -1 puts "a" before "a1".
-    return (*((0, int(piece), "") if piece.isdecimal() else (1, 0, piece) for piece in pieces), (-1, 0, text))
+    return (*keys, (-1, 0, text))
 
 
 def _instance_rank(parts: pd.DataFrame) -> NDArray[np.intp]:

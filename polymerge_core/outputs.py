@@ -168,7 +168,9 @@ class StagedOutputs:
     def _check_replaceable(self, target: Path) -> None:
         for part in filter(Path.exists, _parts(target)):
             if not self._overwrite:
-                raise OutputError(f"{part} exists: give --overwrite to replace it, or name another output")
+                raise OutputError(
+                    f"{part} exists: overwrite it (--overwrite, or overwrite=True), or name another output"
+                )
             if not os.access(part, os.W_OK):
                 raise OutputError(f"{part} is read-only: make it writable, or name another output")
         if target.suffix.lower() != ".gpkg":

@@ -174,7 +174,10 @@ def feet(points: Array, start: Array, end: Array) -> tuple[Array, Array, Array]:
     parameter = inner[0]
     parameter += inner[1]
     square = along * along
-    parameter /= square[0] + square[1]
+    length = square[0] + square[1]
+    # Rounding can put a midpoint onto its neighbour: a segment of no length is its start.
+    length[length == 0.0] = 1.0
+    parameter /= length
     np.maximum(parameter, 0.0, out=parameter)
     np.minimum(parameter, 1.0, out=parameter)
     foot = parameter * along

@@ -36,6 +36,7 @@ ELEMENT_COLUMNS = ("element_id", "class", "score", "n_observations", "n_instance
 INTERVAL_COLUMNS = ("source", "source_fid", "drive", "instance", "from_m", "to_m")
 LINEAGE_COLUMNS = ("source", "source_fid", "drive", "instance", "element_id", "from_m", "to_m", "weight")
 LEFT_OUT_COLUMNS = (*INTERVAL_COLUMNS, "reason")
+ALIAS_COLUMNS = ("old_id", "element_id")
 
 
 @dataclass(frozen=True)
@@ -53,12 +54,15 @@ class LocalMaps:
         Name of the source: the drive where no column names one, and the `source` in lineage and left-out.
     left_out : DataFrame, optional
         What was left out before this point, in the columns `LEFT_OUT_COLUMNS`.
+    id_aliases : DataFrame, optional
+        Of a merged map: the ids that became part of another one, `old_id` and `element_id`.
     """
 
     observations: gpd.GeoDataFrame
     instances: gpd.GeoDataFrame | None = None
     source: str = LOCAL_MAPS_LAYER
     left_out: pd.DataFrame | None = None
+    id_aliases: pd.DataFrame | None = None
 
     def layers(self) -> dict[str, pd.DataFrame]:
         """Return what there is by layer name, ready for `polymerge_core.write_layers`."""

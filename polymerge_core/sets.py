@@ -6,7 +6,7 @@ connected components, and in each the base polyline with the others breadth-firs
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -96,6 +96,7 @@ def find_network(
     observations = observe(as_local_maps(local_maps, "local_maps"), main, options)
     progress(0.1, "looking for neighbours")
     edges = _edges(observations, options, progress, distances=distances)
+    _note_layers_apart(observations, options)
     return Network(observations, edges, components(len(observations.table), edges))
 
 
@@ -127,6 +128,26 @@ def order_sets(network: Network) -> ElementSets:
     # Positions are in the order of instances, then of normalised WKB.
     order = np.lexsort((position, depth, component))
     return ElementSets(component, base, order, np.append(starts, len(table)).astype(np.intp))
+
+
+def _note_layers_apart(observations: Observations, options: Options) -> None:
+    """Say when features of one layer stay apart only because the layer was taken for one local map."""
+    table = observations.table
+    if options.instance_from is not None or table.empty:
+        return
+    first = table["group"] == table["group"].min()
+    rows = table[first & (table["instance_kind"] == "layer") & ~table["is_main"]]
+    apart = 0
+    for _, group in rows.groupby(["class", "is_area"], sort=True):
+        lines = observations.lines[group.index.to_numpy(dtype=np.intp)]
+        none = np.zeros(len(lines), dtype=bool)
+        apart += len(merge_edges(lines, none, options.proximity, distances=False).first)
+    if apart:
+        source = rows["source"].iloc[0]
+        observations.notes["warnings"].append(
+            f"{apart} pairs of features within layer {source!r} are near each other and got no edge, because each "
+            "layer counts as one local map where there are several; instance_from=feature takes each feature for one"
+        )
 
 
 def _edges(observations: Observations, options: Options, progress: Progress, *, distances: bool) -> Edges:
@@ -171,6 +192,11 @@ def as_local_maps(layers: Any, name: str) -> list[LocalMaps]:
     """
     if isinstance(layers, (gpd.GeoDataFrame, gpd.GeoSeries, LocalMaps)):
         return [_as_one(layers, name)]
+    if isinstance(layers, (str, bytes)) or not isinstance(layers, Iterable):
+        raise SchemaError(
+            f"{name} cannot be {layers!r}; give a GeoDataFrame, LocalMaps, or a list of them "
+            "(read_local_maps reads them from files)"
+        )
     return [_as_one(layer, f"{name}_{number}") for number, layer in enumerate(layers, start=1)]
 
 

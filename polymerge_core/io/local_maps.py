@@ -14,6 +14,7 @@ from polymerge_core.io.naming import companion_path, holds_one_layer, tables_bes
 from polymerge_core.io.reading import choose_layers, list_layers, read_chosen, read_layers, read_table
 from polymerge_core.io.sources import opened, split_source
 from polymerge_core.schema import (
+    ALIASES_TABLE,
     AREAS_LAYER,
     ELEMENTS_LAYER,
     INSTANCES_LAYER,
@@ -35,9 +36,10 @@ def read_local_maps(sources: Iterable[str | os.PathLike[str]]) -> list[LocalMaps
     sources : iterable of path
         Files, or ``FILE|layername=LAYER``. A file without a layer means its layer ``local_maps`` (with the
         layer ``instances`` and the table ``left_out`` beside it) where there is one, else its layer
-        ``elements`` (and ``elements_areas``), else all its line and polygon layers. For a file of one layer, the
-        files that `write_layers` put beside it are read as these: ``<stem>_instances.<ext>`` with the table
-        ``left_out`` of ``<stem>_tables.gpkg``, or ``<stem>_areas.<ext>`` where both hold elements.
+        ``elements`` (and ``elements_areas`` and the table ``id_aliases``), else all its line and polygon layers.
+        For a file of one layer, the files that `write_layers` put beside it are read as these:
+        ``<stem>_instances.<ext>`` with the table ``left_out`` of ``<stem>_tables.gpkg``, or ``<stem>_areas.<ext>``
+        and the table ``id_aliases`` where the file holds elements.
 
     Returns
     -------
@@ -98,10 +100,12 @@ def _companions(file: Path, layer: str | None) -> dict[str, Path]:
     """Find what was written beside a file of one layer, by layer name; its columns say what belongs together."""
     if not holds_one_layer(file):
         return {}
-    areas = companion_path(file, AREAS_LAYER, ELEMENTS_LAYER)
-    if layer is None and is_merged_map(areas) and is_merged_map(file):
-        return {AREAS_LAYER: areas}
-    instances, tables = companion_path(file, INSTANCES_LAYER, LOCAL_MAPS_LAYER), tables_beside(file)
+    areas, tables = companion_path(file, AREAS_LAYER, ELEMENTS_LAYER), tables_beside(file)
+    if is_merged_map(file):
+        has_areas = layer is None and is_merged_map(areas)
+        has_aliases = any(each.name == ALIASES_TABLE for each in _layers(tables))
+        return ({AREAS_LAYER: areas} if has_areas else {}) | ({ALIASES_TABLE: tables} if has_aliases else {})
+    instances = companion_path(file, INSTANCES_LAYER, LOCAL_MAPS_LAYER)
     if not (_columns(instances).issuperset(_written_as(file)) and _columns(file).issuperset(_LOCAL_MAP_COLUMNS)):
         return {}
     has_left_out = any(each.name == LEFT_OUT_TABLE for each in _layers(tables))
@@ -125,6 +129,8 @@ def _written_as(file: Path) -> dict[str, str]:
 
 def _complete(maps: LocalMaps, beside: dict[str, Path]) -> LocalMaps:
     """Add what was written beside the observations."""
+    if ALIASES_TABLE in beside:
+        return replace(maps, id_aliases=read_table(beside[ALIASES_TABLE], ALIASES_TABLE))
     if INSTANCES_LAYER not in beside:
         return maps
     file = beside[INSTANCES_LAYER]
@@ -146,6 +152,9 @@ def _read_file(file: Path, layer: str | None = None) -> dict[str, LocalMaps]:
             instances = read_layer(source, beside[INSTANCES_LAYER]) if INSTANCES_LAYER in beside else None
             left_out = read_columns(source, beside[LEFT_OUT_TABLE]) if LEFT_OUT_TABLE in beside else None
             maps[LOCAL_MAPS_LAYER] = replace(maps[LOCAL_MAPS_LAYER], instances=instances, left_out=left_out)
+        aliases = next((each for each in known if each.name == ALIASES_TABLE), None)
+        if ELEMENTS_LAYER in maps and aliases is not None:
+            maps[ELEMENTS_LAYER] = replace(maps[ELEMENTS_LAYER], id_aliases=read_columns(source, aliases))
     return maps
 
 

@@ -102,7 +102,8 @@ def opened(file: Path) -> Iterator[Source]:
 
 def _detect(file: Path) -> str:
     if not file.exists():
-        raise InputError(f"{file}: no such file")
+        hint = "; a layer is named by |layername=LAYER" if "|" in str(file) else ""
+        raise InputError(f"{file}: no such file{hint}")
     if not file.is_file():
         raise InputError(f"{file} is not a file: name a GeoPackage, Shapefile, GeoJSON, FlatGeobuf or GeoParquet file")
     with file.open("rb") as stream:

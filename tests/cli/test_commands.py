@@ -351,7 +351,7 @@ def test_demo_writes_maps_and_a_picture_once(run, tmp_path):
     before = {path: path.read_bytes() for path in folder.iterdir()}
     again = run("demo", folder)
     assert again.code == 1
-    assert "exists: give --overwrite" in again.err
+    assert "exists: overwrite it" in again.err
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 

@@ -365,7 +365,7 @@ BAD = {
     "an origin that is missing": (
         lambda f: f.project(HEADER + POSE, None, "--pose-kind", "origin"),
         2,
-        ["origin must be given with pose_kind=origin"],
+        ["pose_kind=origin needs origin"],
     ),
     "a footprint with decimal commas": (
         lambda f: f.project(HEADER + POSE, None, "--footprint", "-30,0,-15,0,30,0,15,0"),

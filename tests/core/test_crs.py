@@ -88,7 +88,6 @@ class TestDistancesAreGroundDistances:
         ours, theirs = (layer.to_crs(4326).geometry.union_all() for layer in (result, looks))
         assert shapely.hausdorff_distance(ours, theirs) < 2e-5
 
-    @pytest.mark.xfail(reason="the scale of Web Mercator is taken on the sphere", strict=True)
     def test_in_web_mercator_at_the_equator(self):
         # On the ellipsoid, Web Mercator is 0.7 % too long from south to north even there.
         result = merge(two_looks("Quito", 0.998, "EPSG:3857"))

@@ -451,7 +451,7 @@ def test_areas_of_an_older_map_are_replaced_with_permission_only(tmp_path):
     write_layers(tmp_path / "m.fgb", map_of(areas=True))
     (tmp_path / "m.fgb").unlink()
     before = digest(tmp_path / "m_areas.fgb")
-    with pytest.raises(OutputError, match=r"m_areas\.fgb exists: give --overwrite"):
+    with pytest.raises(OutputError, match=r"m_areas\.fgb exists: overwrite it"):
         write_layers(tmp_path / "m.fgb", map_of(areas=False))
     with pytest.raises(OutputError, match=r"m_areas\.fgb is an input"):
         write_layers(tmp_path / "m.fgb", map_of(areas=False), overwrite=True, inputs=[tmp_path / "m_areas.fgb"])

@@ -45,7 +45,7 @@ def test_an_output_is_not_there_before_the_end_and_is_there_after_it(tmp_path):
 
 
 def test_an_existing_output_needs_overwrite(old):
-    with pytest.raises(OutputError, match=r"map\.gpkg exists: give --overwrite"):
+    with pytest.raises(OutputError, match=r"map\.gpkg exists: overwrite it"):
         write(old)
     assert old.read_text() == "old"
     write(old, overwrite=True)
