@@ -133,9 +133,9 @@ class _Finder:
 
     def __call__(self, default: str, name: str | None) -> pd.Series | None:
         data = self.layer.data
-        # The main map has the contract's own columns, whatever the local maps call theirs.
-        named = name is not None and not self.layer.is_main
         columns = [column for column in data.columns if column != data.active_geometry_name]
+        # A main map may have the contract's own columns, whatever the local maps call theirs.
+        named = name is not None and (not self.layer.is_main or name in columns)
         wanted = default if name is None or not named else name
         found = find_column(columns, wanted, named=named, where=self.layer.where)
         if found is None:

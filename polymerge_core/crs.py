@@ -64,7 +64,10 @@ def parse_crs(crs: Any) -> pyproj.CRS:
             f"{crs!r} is not a coordinate reference system that PROJ knows; give one such as EPSG:32632, "
             "or local for plain metric coordinates"
         ) from error
-    return LOCAL_CRS if is_local(parsed) else parsed
+    if is_local(parsed):
+        return LOCAL_CRS
+    # pyproj's own subclasses (ProjectedCRS and others) lack some methods of CRS.
+    return parsed if type(parsed) is pyproj.CRS else pyproj.CRS.from_wkt(parsed.to_wkt())
 
 
 def is_local(crs: pyproj.CRS | None) -> bool:
@@ -121,7 +124,9 @@ def working_crs(crs: pyproj.CRS, bounds: Bounds, *, centre_on: pyproj.CRS | None
         longitude_natural_origin=round((lon.min() + lon.max()) / 2, 4),
     )
     geodetic = crs.geodetic_crs or _LONLAT
-    return ProjectedCRS(conversion, name="Transverse Mercator centred on the data", geodetic_crs=geodetic.to_2d())
+    return parse_crs(
+        ProjectedCRS(conversion, name="Transverse Mercator centred on the data", geodetic_crs=geodetic.to_2d())
+    )
 
 
 def scale_error(crs: pyproj.CRS, lon: NDArray[np.float64], lat: NDArray[np.float64]) -> float:

@@ -44,7 +44,7 @@ def build_elements(
         `old_id`, `element_id` of the main map's ids that are no more.
     """
     table, component, base = observations.table, sets.component, sets.base
-    ids, aliases = _assign_ids(table, sets, shapes, observations.id_aliases)
+    ids, aliases = _assign_ids(observations, sets, shapes)
     weight = table["weight"].to_numpy(dtype=float)
     total = np.bincount(component, weight, len(base))
     columns = {
@@ -86,13 +86,13 @@ def build_lineage(observations: Observations, sets: ElementSets, ids: NDArray[np
 
 
 def _assign_ids(
-    table: pd.DataFrame, sets: ElementSets, shapes: NDArray[np.object_], earlier: pd.DataFrame
+    observations: Observations, sets: ElementSets, shapes: NDArray[np.object_]
 ) -> tuple[NDArray[np.int64], pd.DataFrame]:
     """Keep the smallest id of the main map in each component; number the rest in canonical order.
 
     An id that once meant another element is never given again, and what became of it stays on record.
     """
-    component, base = sets.component, sets.base
+    table, component, base = observations.table, sets.component, sets.base
     known = pd.DataFrame({"old_id": table["main_id"], "component": component})
     # The parts of one multi-part element share its id; only the first keeps it.
     known = known[known["old_id"] >= 0].drop_duplicates("old_id")
@@ -103,11 +103,11 @@ def _assign_ids(
     _, key = np.unique(shapely.to_wkb(shapely.normalize(shapes[fresh])), return_inverse=True)
     _, name = np.unique(table["class"].to_numpy(dtype=str)[base[fresh]], return_inverse=True)
     order = fresh[np.lexsort((base[fresh], key, name))]
-    used = [*known["old_id"], *earlier["old_id"], *earlier["element_id"]]
-    ids[order] = max(used, default=0) + 1 + np.arange(len(order))
+    ids[order] = observations.highest_id + 1 + np.arange(len(order))
     aliases = known.assign(element_id=ids[known["component"]])
     aliases = aliases.loc[aliases["old_id"] != aliases["element_id"], list(ALIAS_COLUMNS)]
     now = dict(zip(aliases["old_id"], aliases["element_id"], strict=True))
+    earlier = observations.id_aliases
     followed = earlier.assign(element_id=earlier["element_id"].map(lambda old: now.get(old, old)))
     aliases = pd.concat([aliases, followed]).astype(np.int64).drop_duplicates("old_id")
     return ids, aliases.sort_values("old_id").reset_index(drop=True)

@@ -54,6 +54,8 @@ class Observations:
         CRS of each layer, by the number in ``table["layer"]``.
     id_aliases : DataFrame
         What became of ids of the main map in earlier merges: `old_id`, `element_id`.
+    highest_id : int
+        The highest id that the main map ever gave, 0 where there is none.
     notes : dict
         What the report says about reading: instance rule, counts of what was cleaned, warnings.
     """
@@ -65,6 +67,7 @@ class Observations:
     out_crs: pyproj.CRS
     layer_crs: list[pyproj.CRS]
     id_aliases: pd.DataFrame
+    highest_id: int
     notes: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -136,7 +139,8 @@ def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], opti
         _note_like_degrees(table, notes)
     known = [maps.id_aliases[list(ALIAS_COLUMNS)] for maps in main_map if maps.id_aliases is not None]
     aliases = pd.concat([empty_table(ALIAS_COLUMNS), *known], ignore_index=True)
-    return Observations(table, attributes, left_out, work, out_crs, layer_crs, aliases, notes)
+    highest = max(0, features["main_id"].max(), *aliases.max(skipna=True).fillna(0).astype(int))
+    return Observations(table, attributes, left_out, work, out_crs, layer_crs, aliases, int(highest), notes)
 
 
 def as_lines(shapes: NDArray[np.object_]) -> NDArray[np.object_]:

@@ -9,6 +9,7 @@ import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from numbers import Real
 from typing import Any
 
 from polymerge_core.errors import OptionError
@@ -69,6 +70,8 @@ class Options:
         _within("min_score", self.min_score, 0.0, 1.0)
         _within("coverage", self.coverage, 0.0, 1.0, open_low=True)
         _within("proximity", self.proximity, 0.0, MAX_PROXIMITY_M, open_low=True, unit=" m")
+        if not isinstance(self.aggregate, (str, Mapping)):
+            raise OptionError(f"aggregate cannot be {self.aggregate!r}; it is a function, or one for each column")
         chosen = [self.aggregate] if isinstance(self.aggregate, str) else self.aggregate.values()
         for function in chosen:
             _one_of("aggregate", function, AGGREGATES)
@@ -80,7 +83,7 @@ def _one_of(name: str, value: object, allowed: tuple[str, ...]) -> None:
 
 
 def _within(name: str, value: object, low: float, high: float, *, open_low: bool = False, unit: str = "") -> None:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    number = not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
     if not (number and low <= float(value) <= high) or (open_low and float(value) == low):  # type: ignore[arg-type]
         bounds = f"above {low:g} and at most {high:g}" if open_low else f"from {low:g} to {high:g}"
         raise OptionError(f"{name} cannot be {value!r}; it is a number {bounds}{unit}")

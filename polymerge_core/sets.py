@@ -7,7 +7,7 @@ connected components, and in each the base polyline with the others breadth-firs
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import geopandas as gpd
@@ -18,7 +18,7 @@ from polymerge_core.errors import SchemaError
 from polymerge_core.network import Edges, breadth_first_depth, components, merge_edges
 from polymerge_core.observations import Observations, observe
 from polymerge_core.options import Options
-from polymerge_core.schema import LocalMaps
+from polymerge_core.schema import LOCAL_MAPS_LAYER, LocalMaps
 
 #: Called with the fraction done (0 to 1) and what is being done; may raise to stop the work.
 Progress = Callable[[float, str], object]
@@ -202,7 +202,8 @@ def as_local_maps(layers: Any, name: str) -> list[LocalMaps]:
 
 def _as_one(layer: Any, name: str) -> LocalMaps:
     if isinstance(layer, LocalMaps):
-        return layer
+        # Without a name of its own it must not pass for another one without a name.
+        return replace(layer, source=name) if layer.source == LOCAL_MAPS_LAYER else layer
     if isinstance(layer, gpd.GeoSeries):
         return LocalMaps(layer.to_frame("geometry"), source=name)
     if isinstance(layer, gpd.GeoDataFrame):
