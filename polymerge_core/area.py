@@ -14,7 +14,7 @@ import shapely
 from numpy.typing import NDArray
 from skimage.draw import polygon as polygon_cells
 from skimage.filters import gaussian
-from skimage.measure import label, regionprops
+from skimage.measure import label
 
 #: Side of a cell, metres.
 CELL_M = 0.1
@@ -133,16 +133,27 @@ def _covered_cells(
     area: shapely.Polygon, origin: NDArray[np.float64], cell: float, shape: tuple[int, int]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return rows and columns of the cells whose centre lies in an area."""
+
+    def cells(ring: shapely.LinearRing) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        column, row = ((shapely.get_coordinates(ring) - origin) / cell).T
+        rows, columns = polygon_cells(row, column, shape)
+        return rows, columns
+
+    if not area.interiors:
+        return cells(area.exterior)
     inside = np.zeros(shape, dtype=bool)
     for index, ring in enumerate((area.exterior, *area.interiors)):
-        column, row = ((shapely.get_coordinates(ring) - origin) / cell).T
-        inside[polygon_cells(row, column, shape)] = index == 0
+        inside[cells(ring)] = index == 0
     rows, columns = np.nonzero(inside)
     return rows, columns
 
 
 def _largest_part(parts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return rows and columns of the part with the most cells, the first where several are as large."""
-    largest = max(regionprops(parts), key=lambda part: (part.num_pixels, -part.label))
-    rows, columns = largest.coords.T
-    return rows, columns
+    """Return the first and last cell of each row of the part with the most cells (the first of equal ones).
+
+    The cells between them lie within the same rectangle.
+    """
+    largest = np.bincount(parts.ravel())[1:].argmax() + 1
+    rows, columns = np.nonzero(parts == largest)
+    ends = np.flatnonzero(np.diff(rows, prepend=-1) | np.diff(rows, append=-1))
+    return rows[ends], columns[ends]

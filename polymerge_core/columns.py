@@ -57,7 +57,7 @@ def read_columns(layers: Sequence[Layer], options: Options) -> tuple[pd.DataFram
     -------
     features : DataFrame
         `layer`, `source`, `source_fid`, `is_main`, `class`, `drive`, `instance`, `instance_kind`, `score`, `sigma`,
-        `timestamp_ns`, `main_id`, `weight`, `looks`, `shape`, `reason` (why it is left out, else None).
+        `has_class`, `timestamp_ns`, `main_id`, `weight`, `looks`, `shape`, `reason` (why it is left out, else None).
     attributes : DataFrame
         The user's own columns, row by row.
     notes : dict
@@ -91,6 +91,9 @@ def _check_layer(layer: Layer) -> None:
         raise SchemaError(f"{layer.where}: not a GeoDataFrame but {type(data).__name__}")
     if data.active_geometry_name is None:
         raise SchemaError(f"{layer.where}: the GeoDataFrame has no geometry column")
+    if not data.columns.is_unique:
+        twice = data.columns[data.columns.duplicated()][0]
+        raise SchemaError(f"{layer.where}: there are two columns {twice!r}; rename one")
     kinds = set(data.geometry.geom_type.dropna().unique())
     if kinds and kinds <= _POINT_TYPES:
         raise SchemaError(f"{layer.where}: the layer holds points; PolyMerge merges lines and polygons")
@@ -177,7 +180,7 @@ def _read_instance(
         table["instance"] = layer.maps.source
     else:
         # The index of a GeoDataFrame need not be unique; a look is one feature all the same.
-        again = table.groupby("source_fid").cumcount()
+        again = table.groupby("source_fid", dropna=False).cumcount()
         table["instance"] = pd.Series(
             [
                 f"{fid} ({count + 1})" if count else str(fid)
@@ -202,7 +205,7 @@ def _read_score(find: _Finder, options: Options, table: pd.DataFrame) -> None:
         return
     if len(score) and not ((score >= 0) & (score <= 1)).any():
         raise SchemaError(
-            f"{find.layer.where}: the column {column.name!r} holds no scores, which are between 0 and 1; "
+            f"{find.layer.where}: the column {column.name!r} holds no scores, which are between 0 and 1; rename it, or "
             "name another column with score_field"
         )
     _leave_out(table, ~np.isfinite(score), "the score is not a number")
@@ -242,7 +245,7 @@ def _nanoseconds(held: pd.Series, where: str) -> NDArray[np.int64]:
 def _not_a_timestamp(unfit: pd.Series, where: str) -> SchemaError:
     return SchemaError(
         f"{where}, column {unfit.name}: {unfit.iloc[0]!s} is not a timestamp; timestamps are dates with times, or "
-        "integer nanoseconds (name another column with timestamp_field)"
+        "integer nanoseconds (rename the column, or name another one with timestamp_field)"
     )
 
 
@@ -288,7 +291,11 @@ def _user_columns(layer: Layer, used: set[str], notes: dict[str, Any]) -> pd.Dat
         for column in layer.data.columns
         if column not in used and column != layer.data.active_geometry_name and str(column).lower() not in ours
     ]
-    return pd.DataFrame(layer.data[columns]).reset_index(drop=True)
+    table = pd.DataFrame(layer.data[columns]).reset_index(drop=True)
+    if "geometry" not in table:
+        return table
+    notes["warnings"].append(f"{layer.where}: the column 'geometry' is called 'geometry_1' in the result")
+    return table.rename(columns={"geometry": "geometry_1"})
 
 
 def _join_attributes(tables: list[pd.DataFrame], notes: dict[str, Any]) -> pd.DataFrame:

@@ -159,6 +159,9 @@ def _aggregate(values: pd.Series[Any], component: NDArray[np.intp], function: st
         return _mode(values, component)
     groups = values.groupby(component)
     if function == "sum":
+        whole = pd.api.types.is_integer_dtype(values) and values.notna().any()
+        if whole and float(values.abs().max()) * len(values) >= 2.0**63:
+            groups = values.astype("Float64").groupby(component)  # rather inexact than wrapped round
         return groups.sum(min_count=1)  # the sum of nothing is not 0
     try:
         return groups.agg(function)

@@ -76,13 +76,14 @@ def network_layers(graph: nx.Graph) -> dict[str, gpd.GeoDataFrame]:
     if nodes.empty:
         nodes = pd.DataFrame(columns=["source", "source_fid", "drive", "instance", "class", "component", "geometry"])
     lines = as_lines(nodes.pop("geometry").to_numpy(dtype=object))
-    nodes.insert(0, "observation", np.arange(len(nodes)))
-    ends = np.array(list(graph.edges()), dtype=np.intp).reshape(-1, 2)
+    # In a part of a graph the nodes keep their names, which are no longer positions.
+    ends = nodes.index.get_indexer(np.array(list(graph.edges()), dtype=np.intp).ravel()).reshape(-1, 2)
+    nodes.insert(0, "observation", nodes.index.to_numpy())
     middle = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True))
     edges = pd.DataFrame(
         {
-            "from_observation": ends[:, 0],
-            "to_observation": ends[:, 1],
+            "from_observation": nodes["observation"].to_numpy()[ends[:, 0]],
+            "to_observation": nodes["observation"].to_numpy()[ends[:, 1]],
             "class": nodes["class"].to_numpy()[ends[:, 0]],
             "component": nodes["component"].to_numpy()[ends[:, 0]],
             "distance_m": [distance for _, _, distance in graph.edges(data="distance")],

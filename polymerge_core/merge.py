@@ -259,14 +259,17 @@ def _report(
 ) -> dict[str, Any]:
     table, left_out = observations.table, observations.left_out
     local = table[~table["is_main"]]
+    made = elements.groupby("class")["length_m"].agg(elements="size", elements_m="sum")
+    seen = local.groupby("class")["length_m"].agg(observations="size", observed_m="sum")
+    by_class = made.join(seen).fillna(0)
     classes = {
-        str(name): {
-            "observations": len(rows),
-            "observed_m": round(float(rows["length_m"].sum()), 3),
-            "elements": int((elements["class"] == name).sum()),
-            "elements_m": round(float(elements.loc[elements["class"] == name, "length_m"].sum()), 3),
+        str(row.Index): {
+            "observations": int(row.observations),
+            "observed_m": round(float(row.observed_m), 3),
+            "elements": int(row.elements),
+            "elements_m": round(float(row.elements_m), 3),
         }
-        for name, rows in table.groupby("class", sort=True)
+        for row in by_class.itertuples()
     }
     warnings = list(observations.notes["warnings"])
     several = np.diff(sets.bounds) > 1

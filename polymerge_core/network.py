@@ -28,8 +28,8 @@ _SHORT = 64
 #: Vertices checked at once: a fraction of a second's work.
 _VERTICES = 1_000_000
 
-#: More pairs than this within the proximity are a mistake in the data or in the threshold (24 bytes each).
-MAX_EDGES = 30_000_000
+#: More pairs than this within the proximity are a mistake in the data or in the threshold (some 70 bytes each).
+MAX_EDGES = 20_000_000
 
 
 class Edges(NamedTuple):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from numbers import Real
 from typing import Any
@@ -59,12 +59,16 @@ class Options:
                 near = difflib.get_close_matches(name, known, n=1)
                 hint = f"; did you mean {near[0]}?" if near else f"; the options are {', '.join(known)}"
                 raise OptionError(f"there is no option {name!r}{hint}")
-        area = chosen.pop("area", None)
-        named = {area} if isinstance(area, str) else set(area or ())
+        area = chosen.pop("area", None) or ()
+        named = {area} if isinstance(area, str) else set(area) if isinstance(area, Iterable) else {area}
+        if not all(isinstance(name, str) for name in named):
+            raise OptionError(f"area cannot be {area!r}; it is the name of a class, or several")
         return cls(area=AREA_CLASSES | named, **chosen)
 
     def __post_init__(self) -> None:
         _one_of("method", self.method, METHODS)
+        if not isinstance(self.class_name, str):
+            raise OptionError(f"class_name cannot be {self.class_name!r}; it is a text")
         if self.instance_from is not None:
             _one_of("instance_from", self.instance_from, INSTANCE_FROM)
         _within("min_score", self.min_score, 0.0, 1.0)

@@ -107,7 +107,7 @@ def find_column(columns: Iterable[object], name: str, *, named: bool, where: str
     SchemaError
         If a named column is missing, or several differ from it in case only.
     """
-    present = [str(column) for column in columns]
+    present = [column for column in columns if isinstance(column, str)]
     if name in present:
         return name
     alike = [column for column in present if column.lower() == name.lower()]

@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 
 from polymerge_core.errors import SchemaError
 from polymerge_core.network import Edges, breadth_first_depth, components, merge_edges
-from polymerge_core.observations import Observations, observe
+from polymerge_core.observations import Observations, as_lines, observe
 from polymerge_core.options import Options
 from polymerge_core.schema import LOCAL_MAPS_LAYER, LocalMaps
+
+#: Features of the first layer that are looked at for the warning that they stay apart.
+_LOOKED_AT = 1000
 
 #: Called with the fraction done (0 to 1) and what is being done; may raise to stop the work.
 Progress = Callable[[float, str], object]
@@ -137,11 +140,13 @@ def _note_layers_apart(observations: Observations, options: Options) -> None:
         return
     first = table["group"] == table["group"].min()
     rows = table[first & (table["instance_kind"] == "layer") & ~table["is_main"]]
+    # A look at the start of the layer is enough to tell, and it must cost little beside the merge.
+    rows = rows.head(_LOOKED_AT)
+    lines = as_lines(rows["shape"].to_numpy())
     apart = 0
-    for _, group in rows.groupby(["class", "is_area"], sort=True):
-        lines = observations.lines[group.index.to_numpy(dtype=np.intp)]
-        none = np.zeros(len(lines), dtype=bool)
-        apart += len(merge_edges(lines, none, options.proximity, distances=False).first)
+    for members in rows.reset_index(drop=True).groupby(["class", "is_area"], sort=True).indices.values():
+        none = np.zeros(len(members), dtype=bool)
+        apart += len(merge_edges(lines[members], none, options.proximity, distances=False).first)
     if apart:
         source = rows["source"].iloc[0]
         observations.notes["warnings"].append(

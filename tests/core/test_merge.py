@@ -720,7 +720,7 @@ class TestReport:
             "areas_with_lowered_coverage": 0,
             "classes": {
                 "boundary": {"observations": 1, "observed_m": 10.0, "elements": 1, "elements_m": 10.0},
-                "divider": {"observations": 2, "observed_m": 20.0, "elements": 1, "elements_m": 11.0},
+                "divider": {"observations": 1, "observed_m": 10.0, "elements": 1, "elements_m": 11.0},
             },
             "warnings": [],
         }

@@ -6,7 +6,15 @@ import geopandas as gpd
 import pytest
 from shapely import LineString, box
 
-from polymerge_core import LocalMaps, SchemaError, merge, read_local_maps, write_layers
+from polymerge_core import (
+    LocalMaps,
+    SchemaError,
+    merge,
+    merge_network,
+    network_layers,
+    read_local_maps,
+    write_layers,
+)
 
 UTM = "EPSG:32632"
 
@@ -117,3 +125,36 @@ def test_a_main_map_is_read_by_the_named_class_column_where_it_has_it():
 def test_two_local_maps_without_names_are_two_looks():
     result = merge([LocalMaps(layer(line(0))), LocalMaps(layer(line(0.5)))])
     assert result.elements["n_instances"].tolist() == [2]
+
+
+def test_a_second_column_of_one_name_is_refused():
+    twice = layer(line(0), a=[1], b=[2]).rename(columns={"b": "a"})
+    with pytest.raises(SchemaError, match="two columns 'a'"):
+        merge(twice)
+
+
+def test_a_text_column_called_geometry_is_kept_under_another_name():
+    named = layer(line(0)).rename_geometry("shape").assign(geometry=["kerb"])
+    result = merge(named)
+    assert result.elements["geometry_1"].tolist() == ["kerb"]
+    assert "'geometry_1'" in result.report["warnings"][0]
+
+
+def test_sums_of_large_numbers_do_not_wrap_round():
+    result = merge(layer(*(line(y / 10) for y in range(4)), n=[2**62] * 4), aggregate="sum")
+    assert result.elements["n"].tolist() == [2.0**64]
+
+
+def test_layers_of_a_part_of_a_network_name_the_same_observations():
+    graph = merge_network(layer(line(0), line(50), line(50.5)))
+    (pair,) = graph.edges
+    edges = network_layers(graph.subgraph(pair))["edges"]
+    assert edges[["from_observation", "to_observation"]].to_numpy().tolist() == [sorted(pair)]
+    assert edges.length.tolist() == pytest.approx([0.5])
+
+
+def test_every_class_is_counted():
+    many = layer(*(line(2.0 * y) for y in range(300)), **{"class": [f"c{y}" for y in range(300)]})
+    classes = merge(many).report["classes"]
+    assert len(classes) == 300
+    assert classes["c7"] == {"observations": 1, "observed_m": 50.0, "elements": 1, "elements_m": 50.0}
