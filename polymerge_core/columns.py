@@ -61,7 +61,7 @@ def read_columns(layers: Sequence[Layer], options: Options) -> tuple[pd.DataFram
     attributes : DataFrame
         The user's own columns, row by row.
     notes : dict
-        `instance_from` of each source and `warnings`.
+        `instance_from` and `footprints` of each source, and `warnings`.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def read_columns(layers: Sequence[Layer], options: Options) -> tuple[pd.DataFram
         If a named column is missing, or a column cannot be what it is named for.
     """
     count = sum(not layer.is_main and not layer.data.empty for layer in layers)
-    notes: dict[str, Any] = {"instance_from": {}, "warnings": []}
+    notes: dict[str, Any] = {"instance_from": {}, "footprints": {}, "warnings": []}
     features, attributes = [], []
     for number, layer in enumerate(layers):
         _check_layer(layer)
@@ -191,6 +191,8 @@ def _read_instance(
     table["instance_kind"] = rule
     if not layer.is_main:
         notes["instance_from"][layer.maps.source] = rule
+        known = layer.maps.instances is not None
+        notes["footprints"][layer.maps.source] = "instances" if known else "hull of the observations"
 
 
 def _read_score(find: _Finder, options: Options, table: pd.DataFrame) -> None:

@@ -294,6 +294,7 @@ def _report(
         "working_crs": crs_name(observations.crs),
         "out_crs": crs_name(observations.out_crs),
         "instance_from": observations.notes["instance_from"],
+        "footprints": observations.notes["footprints"],
         "observations": len(local),
         "main_map_elements": len(table) - len(local),
         "instances": int(local["group"].nunique()),

@@ -710,6 +710,7 @@ class TestReport:
             "working_crs": "local",
             "out_crs": "local",
             "instance_from": {"local_maps": "column"},
+            "footprints": {"local_maps": "hull of the observations"},
             "observations": 2,
             "main_map_elements": 1,
             "instances": 2,

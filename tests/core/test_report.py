@@ -158,3 +158,11 @@ def test_every_class_is_counted():
     classes = merge(many).report["classes"]
     assert len(classes) == 300
     assert classes["c7"] == {"observations": 1, "observed_m": 50.0, "elements": 1, "elements_m": 50.0}
+
+
+def test_where_footprints_come_from_is_said():
+    looks = layer(line(0), instance=[1])
+    footprints = layer(box(0, 0, 9, 9), drive=["a"], instance=[1])
+    sources = [LocalMaps(looks, footprints, source="a"), LocalMaps(looks, source="b")]
+    expected = {"a": "instances", "b": "hull of the observations"}
+    assert merge(sources).report["footprints"] == expected
