@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import click
 import geopandas as gpd
 import numpy as np
+import pandas as pd
 
 import polymerge_core as pm
 from polymerge_core import console
@@ -110,7 +111,7 @@ def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None
         chosen[name] = _numbers(name, chosen[name], form)
     chosen["drive"] = chosen["drive"] or output.stem
     inputs = [predictions, poses, *([lidar_to_ego] if lidar_to_ego else [])]
-    with _Run(output, inputs, **run) as job:
+    with _Run(output, inputs, ["local_maps", "instances"], **run) as job:
         job.progress(0.0, "reading the predictions")
         seen = pm.read_predictions(predictions)
         matrix = read_matrix(lidar_to_ego) if lidar_to_ego else None
@@ -145,7 +146,8 @@ def merge(local_maps: tuple[str, ...], output: Path, main_map: str | None, **cho
     run = _split_off(chosen)
     chosen["aggregate"] = _aggregate(chosen["aggregate"])
     Options.of(**chosen)  # a wrong value is told before anything is read
-    with _Run(output, [*local_maps, *([] if main_map is None else [main_map])], **run) as job:
+    inputs = [*local_maps, *([] if main_map is None else [main_map])]
+    with _Run(output, inputs, ["elements"], tables=["lineage"], **run) as job:
         job.progress(0.0, "reading the files")
         layers = pm.read_local_maps(local_maps)
         into = None if main_map is None else pm.read_local_maps([main_map])
@@ -172,7 +174,8 @@ def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **c
     """Write who would be merged with whom: layers edges and observations."""
     run = _split_off(chosen)
     Options.of(**chosen)
-    with _Run(output, [*local_maps, *([] if main_map is None else [main_map])], **run) as job:
+    inputs = [*local_maps, *([] if main_map is None else [main_map])]
+    with _Run(output, inputs, ["edges", "observations"], **run) as job:
         job.progress(0.0, "reading the files")
         layers = pm.read_local_maps(local_maps)
         into = None if main_map is None else pm.read_local_maps([main_map])
@@ -215,13 +218,18 @@ def env() -> None:
 
 
 class _Run:
-    """One run of a command: its outputs appear together at the end, or not at all."""
+    """One run of a command: its outputs appear together at the end, or not at all.
+
+    `layers` and `tables` are those that it writes whatever comes out.
+    """
 
     def __init__(
         self,
         output: Path,
         inputs: Sequence[str],
+        layers: Sequence[str],
         *,
+        tables: Sequence[str] = (),
         overwrite: bool,
         report_file: str | None,
         progress: console.ProgressMode,
@@ -233,9 +241,9 @@ class _Run:
         files = [file for path in inputs for file in source_files(path)]
         self._outputs = StagedOutputs(overwrite=overwrite, inputs=files)
         report = [Path(report_file)] if report_file not in (None, "-") else []
-        # Which layers a run writes is known at its end; the main one is always there.
-        main = layer_targets(output, {"main": gpd.GeoDataFrame()})["main"]
-        self._outputs.check([main, *report])
+        # All layers of a run are known at its end; those that are certain are checked before its work.
+        certain = {name: gpd.GeoDataFrame() for name in layers} | {name: pd.DataFrame() for name in tables}
+        self._outputs.check([*dict.fromkeys(layer_targets(output, certain).values()), *report])
         self.progress = console.ProgressReport(progress)
         self.written = str(output)
         if watch_stdin:

@@ -6,9 +6,7 @@ without dates in the file, so that the same map gives the same bytes.
 
 from __future__ import annotations
 
-import contextlib
 import os
-import tempfile
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,7 +21,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from polymerge_core.crs import Bounds, is_local, working_crs
-from polymerge_core.errors import CrsError, InputError, OptionError, OutputError
+from polymerge_core.errors import CrsError, InputError, OptionError
+from polymerge_core.outputs import StagedOutputs
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -255,17 +254,8 @@ def _legend(figure: Figure, colours: dict[str, str], *, with_reference: bool) ->
 
 
 def _save(figure: Figure, path: Path) -> None:
-    """Write the picture beside its place and move it there, so that a crash leaves no half file."""
+    """Write the picture so that a crash leaves no half file."""
     picture = BytesIO()
     figure.savefig(picture, format="png", metadata={"Software": None})
-    partial: str | None = None
-    try:
-        handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(picture.getvalue())
-        Path(partial).replace(path)
-    except OSError as error:
-        if partial is not None:
-            with contextlib.suppress(OSError):
-                Path(partial).unlink(missing_ok=True)
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another place") from error
+    with StagedOutputs(overwrite=True) as outputs:
+        outputs.stage(path).write_bytes(picture.getvalue())

@@ -475,3 +475,13 @@ def test_a_fault_in_a_process_of_its_own_is_one_line_and_an_exit_code(run_alone,
     outcome = run_alone("merge", "nowhere.gpkg", "-o", "road.gpkg", cwd=tmp_path)
     assert outcome == (1, "", "error: nowhere.gpkg: no such file\n")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_companion_that_exists_is_told_before_the_work(run, tmp_path, monkeypatch):
+    draw(tmp_path / "roads.gpkg", noisy_copies(2, 5))
+    (tmp_path / "m_tables.gpkg").write_bytes(b"kept")
+    monkeypatch.setattr("polymerge_core.merge", lambda *_, **__: pytest.fail("the merge was run"))
+    outcome = run("merge", tmp_path / "roads.gpkg", "-o", tmp_path / "m.shp")
+    assert outcome.code == 1
+    assert "m_tables.gpkg exists" in outcome.err
+    assert (tmp_path / "m_tables.gpkg").read_bytes() == b"kept"
