@@ -50,8 +50,9 @@ class LocalMaps:
     instances : GeoDataFrame, optional
         One row a local map (frame), the ones that saw nothing included: `drive`, `instance`, `timestamp_ns`,
         `x`, `y`, `heading`, `n_observations`; the geometry is the footprint, the area looked at.
-    source : str, default "local_maps"
-        Name of the source: the drive where no column names one, and the `source` in lineage and left-out.
+    source : str, optional
+        Name of the source: the drive where no column names one, and the `source` in lineage and left-out. Where it has
+        none, a merge calls it ``local_maps``, or ``local_maps_1`` and so on in a list.
     left_out : DataFrame, optional
         What was left out before this point, in the columns `LEFT_OUT_COLUMNS`.
     id_aliases : DataFrame, optional
@@ -60,7 +61,7 @@ class LocalMaps:
 
     observations: gpd.GeoDataFrame
     instances: gpd.GeoDataFrame | None = None
-    source: str = LOCAL_MAPS_LAYER
+    source: str = ""
     left_out: pd.DataFrame | None = None
     id_aliases: pd.DataFrame | None = None
 

@@ -18,7 +18,7 @@ from polymerge_core.errors import SchemaError
 from polymerge_core.network import Edges, breadth_first_depth, components, merge_edges
 from polymerge_core.observations import Observations, as_lines, observe
 from polymerge_core.options import Options
-from polymerge_core.schema import LOCAL_MAPS_LAYER, LocalMaps
+from polymerge_core.schema import LocalMaps
 
 #: Features of the first layer that are looked at for the warning that they stay apart.
 _LOOKED_AT = 1000
@@ -208,7 +208,7 @@ def as_local_maps(layers: Any, name: str) -> list[LocalMaps]:
 def _as_one(layer: Any, name: str) -> LocalMaps:
     if isinstance(layer, LocalMaps):
         # Without a name of its own it must not pass for another one without a name.
-        return replace(layer, source=name) if layer.source == LOCAL_MAPS_LAYER else layer
+        return replace(layer, source=name) if not layer.source else layer
     if isinstance(layer, gpd.GeoSeries):
         return LocalMaps(layer.to_frame("geometry"), source=name)
     if isinstance(layer, gpd.GeoDataFrame):

@@ -1,0 +1,129 @@
+"""`polymerge:mergelocalmaps`: overlapping digitisations of the same lines become one map."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from qgis.core import QgsProcessingParameterDefinition, QgsProcessingParameterNumber
+
+from ..parameters import (
+    choice_parameter,
+    column_parameters,
+    explained,
+    layer_parameters,
+    map_parameters,
+    text_parameter,
+)
+from ..results import Result
+from ..translation import mark, tr
+from .layers import READING_OPTIONS, LayerAlgorithm
+
+
+class MergeLocalMaps(LayerAlgorithm):
+    """Merge local maps into one map."""
+
+    NAME = "mergelocalmaps"
+    TITLE = mark("Merge local maps")
+    ICON = "merge"
+    TAGS = mark("merge,conflate,conflation,average,mean,line,polyline,GPS,track,trace,survey,HD map,lane")
+    SUMMARY = mark("Merges many overlapping, imperfect digitisations of the same lines or areas into one clean map.")
+    HELP = mark(
+        "Give it local maps of a perception model, GPS tracks of one path, or several surveys of one street. No column "
+        "is needed. Every input feature ends in an element of the map (see Lineage) or in the list of those left out."
+    )
+    COMMAND = "merge"
+    OPTIONS = (*READING_OPTIONS, "METHOD", "COVERAGE", "AGGREGATE")
+    NUMBERS = (
+        ("N_ELEMENTS", mark("Number of elements")),
+        ("N_OBSERVATIONS", mark("Number of observations")),
+        ("N_LEFT_OUT", mark("Number of features left out")),
+    )
+
+    def inputs(self) -> list[QgsProcessingParameterDefinition]:
+        """Return the layers, their columns, and how to merge."""
+        coverage = QgsProcessingParameterNumber(
+            "COVERAGE",
+            tr("Coverage of areas"),
+            type=QgsProcessingParameterNumber.Type.Double,
+            defaultValue=0.5,
+            minValue=0.0,
+            maxValue=1.0,
+        )
+        return [
+            *layer_parameters(),
+            *column_parameters(),
+            choice_parameter("METHOD", tr("Method"), tr("polymerge: the method as it was published."), ("polymerge",)),
+            explained(
+                coverage,
+                tr("The share of the observations of an area that must cover a place for it to belong to the area."),
+                advanced=True,
+            ),
+            text_parameter(
+                "AGGREGATE",
+                tr("How columns are carried"),
+                tr(
+                    "first, mode, mean, min, max or sum for all columns, or COLUMN=FUNCTION for single ones, with "
+                    "commas between. first: from the observation that the others were merged into."
+                ),
+                default="first",
+            ),
+            *map_parameters(),
+        ]
+
+    def results(self) -> list[Result]:
+        """Return the merged map and the tables beside it."""
+        return [
+            Result(
+                "OUTPUT",
+                tr("Merged map"),
+                "elements",
+                "line",
+                tr("One line for each element, with its id, class, mean score and number of observations."),
+                style="merged_map",
+                optional=False,
+                shown_empty=True,
+            ),
+            Result(
+                "AREAS",
+                tr("Merged areas"),
+                "elements_areas",
+                "polygon",
+                tr("The elements that are areas, such as pedestrian crossings that came as polygons."),
+                style="merged_areas",
+                like="elements",
+            ),
+            Result(
+                "LINEAGE",
+                tr("Lineage"),
+                "lineage",
+                "table",
+                tr("Which stretch of which input feature went into which element."),
+                style="lineage",
+                shown_empty=True,
+            ),
+            Result(
+                "LEFT_OUT",
+                tr("Left out"),
+                "left_out",
+                "table",
+                tr("What is in no element, with the reason."),
+                style="left_out",
+            ),
+            Result(
+                "ID_ALIASES",
+                tr("Retired ids"),
+                "id_aliases",
+                "table",
+                tr("The ids of elements of a main map that became part of another one."),
+                style="id_aliases",
+                wanted=False,
+            ),
+        ]
+
+    def numbers(self, report: dict[str, Any]) -> dict[str, float]:
+        """Count what came out."""
+        return {
+            "N_ELEMENTS": report["elements"],
+            "N_OBSERVATIONS": report["observations"],
+            "N_LEFT_OUT": sum(report["left_out"].values()),
+        }

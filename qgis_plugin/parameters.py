@@ -1,0 +1,283 @@
+"""The parameters, each with its help; named as the options of the command line are, in capitals.
+
+What a parameter is called says how it goes to the command line, so that nothing has to be translated by hand:
+`MIN_SCORE` becomes ``--min-score``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from qgis.core import (
+    QgsCoordinateReferenceSystem,
+    QgsProcessing,
+    QgsProcessingAlgorithm,
+    QgsProcessingContext,
+    QgsProcessingParameterBoolean,
+    QgsProcessingParameterCrs,
+    QgsProcessingParameterDefinition,
+    QgsProcessingParameterDistance,
+    QgsProcessingParameterEnum,
+    QgsProcessingParameterFeatureSource,
+    QgsProcessingParameterField,
+    QgsProcessingParameterFile,
+    QgsProcessingParameterMultipleLayers,
+    QgsProcessingParameterNumber,
+    QgsProcessingParameterString,
+    QgsUnitTypes,
+)
+
+from .translation import tr
+
+_Definition = TypeVar("_Definition", bound=QgsProcessingParameterDefinition)
+
+#: The choice that leaves it to the command line.
+AUTOMATIC = "auto"
+
+_LINES = QgsProcessing.SourceType.TypeVectorLine
+_AREAS = QgsProcessing.SourceType.TypeVectorPolygon
+_ANY = QgsProcessing.SourceType.TypeVectorAnyGeometry
+_TABLE = QgsProcessing.SourceType.TypeVector
+
+
+def explained(definition: _Definition, text: str, *, advanced: bool = False) -> _Definition:
+    """Give a definition its help, and its place among the rare options."""
+    definition.setHelp(text)
+    if advanced:
+        definition.setFlags(definition.flags() | QgsProcessingParameterDefinition.Flag.FlagAdvanced)
+    return definition
+
+
+def layer_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return what merging and looking at the network read, and how near is near."""
+    layers = QgsProcessingParameterMultipleLayers("LOCAL_MAPS", tr("Layers to merge"), layerType=_ANY)
+    layers.setMinimumNumberInputs(1)
+    proximity = QgsProcessingParameterDistance(
+        "PROXIMITY", tr("Proximity"), defaultValue=1.0, parentParameterName="", minValue=0.0, maxValue=1000.0
+    )
+    proximity.setDefaultUnit(QgsUnitTypes.DistanceUnit.DistanceMeters)
+    return [
+        explained(
+            layers,
+            tr(
+                "Line or polygon layers in any CRS. In one layer each feature is a look of its own (twelve GPS "
+                "tracks), of several layers each layer is one look (three surveys)."
+            ),
+        ),
+        switch_parameter(
+            "SELECTED_ONLY",
+            tr("Selected features only"),
+            tr("Of layers with a selection, take the selected features; of the others all."),
+            advanced=False,
+        ),
+        explained(
+            proximity,
+            tr(
+                "Lines that come nearer to each other than this are taken for the same element. In metres on the "
+                "ground, whatever the CRS of the layers; at most 1000 m."
+            ),
+        ),
+        explained(
+            QgsProcessingParameterFeatureSource("MAIN_MAP", tr("Main map"), types=[_LINES, _AREAS], optional=True),
+            tr("An earlier result to merge into; its elements keep their ids."),
+        ),
+    ]
+
+
+def column_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return which columns mean what; none is needed."""
+    return [
+        _field("CLASS_FIELD", tr("Class column"), tr("Only features of one class are merged. Empty: class, if any.")),
+        text_parameter(
+            "CLASS_NAME",
+            tr("Class of features without one"),
+            tr("What the class of a feature is where no column names one."),
+            default="line",
+        ),
+        _field("DRIVE_FIELD", tr("Drive or survey column"), tr("Empty: drive, if any; else the layer's name.")),
+        _field(
+            "INSTANCE_FIELD",
+            tr("Local map (frame) column"),
+            tr("Features of one frame were seen side by side. Empty: instance, if there is such a column."),
+        ),
+        choice_parameter(
+            "INSTANCE_FROM",
+            tr("What a local map is"),
+            tr(
+                "column: the features with one value in the column above; layer: all features of a layer; feature: "
+                "each feature. auto: column where there is one, else layer for several layers, feature for one."
+            ),
+            (AUTOMATIC, "column", "layer", "feature"),
+        ),
+        _field("SCORE_FIELD", tr("Score column"), tr("Confidence from 0 to 1. Empty: score, if any; else 1.")),
+        explained(
+            QgsProcessingParameterNumber(
+                "MIN_SCORE",
+                tr("Lowest score"),
+                type=QgsProcessingParameterNumber.Type.Double,
+                defaultValue=0.0,
+                minValue=0.0,
+                maxValue=1.0,
+            ),
+            tr("Features with a lower score are left out, and listed there."),
+            advanced=True,
+        ),
+        _field("TIMESTAMP_FIELD", tr("Time column"), tr("Orders the local maps. Empty: timestamp, if any.")),
+        text_parameter(
+            "AREA",
+            tr("More area classes"),
+            tr("Classes that are areas even where they come as lines, with commas between, beside ped_crossing."),
+        ),
+    ]
+
+
+def map_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return the rest of a main map, the CRS, and what to do with bad features."""
+    return [
+        explained(
+            QgsProcessingParameterFeatureSource(
+                "MAIN_MAP_AREAS", tr("Areas of the main map"), types=[_AREAS], optional=True
+            ),
+            tr("Where the main map has its areas in a layer of their own."),
+            advanced=True,
+        ),
+        explained(
+            QgsProcessingParameterFeatureSource(
+                "MAIN_MAP_ALIASES", tr("Retired ids of the main map"), types=[_TABLE], optional=True
+            ),
+            tr("The table of retired ids that came with the main map, so that no id is ever given twice."),
+            advanced=True,
+        ),
+        explained(
+            QgsProcessingParameterCrs("CRS", tr("CRS of layers without one"), optional=True),
+            tr("Says where layers without a CRS lie; layers that have one are not touched by it."),
+            advanced=True,
+        ),
+        switch_parameter(
+            "LOCAL_CRS",
+            tr("Layers without a CRS are in plain metres"),
+            tr("Their coordinates are metres that lie nowhere on Earth; nothing is reprojected."),
+        ),
+        explained(
+            QgsProcessingParameterCrs("OUT_CRS", tr("CRS of the result"), optional=True),
+            tr("Empty: that of the main map, else that of the first layer."),
+            advanced=True,
+        ),
+        switch_parameter(
+            "STRICT",
+            tr("Stop at a feature that cannot be used"),
+            tr("Otherwise such features are left out, and listed there with the reason."),
+        ),
+    ]
+
+
+def choice_parameter(
+    name: str, title: str, text: str, values: Sequence[str], *, advanced: bool = True
+) -> QgsProcessingParameterEnum:
+    """Return a choice between values, the first being the default."""
+    # Values by name: a number in a script or a model would change its meaning when a value is added.
+    choice = QgsProcessingParameterEnum(
+        name, title, options=list(values), defaultValue=values[0], usesStaticStrings=True
+    )
+    return explained(choice, text, advanced=advanced)
+
+
+def switch_parameter(name: str, title: str, text: str, *, advanced: bool = True) -> QgsProcessingParameterBoolean:
+    """Return something that is off unless the user wants it."""
+    return explained(QgsProcessingParameterBoolean(name, title, defaultValue=False), text, advanced=advanced)
+
+
+def text_parameter(
+    name: str, title: str, text: str, *, default: str | None = None, advanced: bool = True
+) -> QgsProcessingParameterString:
+    """Return a text that may be empty."""
+    definition = QgsProcessingParameterString(name, title, defaultValue=default, optional=True)
+    return explained(definition, text, advanced=advanced)
+
+
+def file_parameter(
+    name: str, title: str, text: str, *, kinds: str = "", default: str | None = None, optional: bool = False
+) -> QgsProcessingParameterFile:
+    """Return a file to read; `kinds` is a filter such as ``JSON (*.json)``."""
+    # QGIS's own filter for all files, *.*, refuses names without an extension.
+    wanted = ";;".join([*([kinds] if kinds else []), tr("All files (*)")])
+    definition = QgsProcessingParameterFile(name, title, defaultValue=default, optional=optional, fileFilter=wanted)
+    return explained(definition, text)
+
+
+def folder_parameter(name: str, title: str, text: str) -> QgsProcessingParameterFile:
+    """Return a folder that may be left empty."""
+    folder = QgsProcessingParameterFile.Behavior.Folder
+    return explained(QgsProcessingParameterFile(name, title, behavior=folder, optional=True), text)
+
+
+def _field(name: str, title: str, text: str) -> QgsProcessingParameterField:
+    definition = QgsProcessingParameterField(name, title, parentLayerParameterName="LOCAL_MAPS", optional=True)
+    return explained(definition, text, advanced=name != "CLASS_FIELD")
+
+
+def option_arguments(
+    names: Sequence[str], algorithm: QgsProcessingAlgorithm, parameters: dict[str, Any], context: QgsProcessingContext
+) -> list[str]:
+    """Return what the user chose as the command line takes it.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The parameters that are options of the command.
+    algorithm : QgsProcessingAlgorithm
+        Knows their types.
+    parameters, context
+        As Processing gives them to an algorithm.
+
+    Returns
+    -------
+    list of str
+        ``--min-score=0.3`` and so on; nothing for what the user left empty.
+    """
+    arguments = []
+    for name in names:
+        option = "--" + name.lower().replace("_", "-")
+        kind = algorithm.parameterDefinition(name).type()
+        if name == "CRS" and algorithm.parameterAsBoolean(parameters, "LOCAL_CRS", context):
+            arguments.append("--crs=local")
+            continue
+        if kind == "boolean":
+            arguments += [option] if algorithm.parameterAsBoolean(parameters, name, context) else []
+            continue
+        value = _as_text(kind, name, algorithm, parameters, context)
+        several = [each.strip() for each in value.split(",")] if name in REPEATED else [value]
+        arguments += [f"{option}={each}" for each in several if each]
+    return arguments
+
+
+#: Options of the command line that can be given several times: here one text, with commas between.
+REPEATED = frozenset({"AREA", "AGGREGATE"})
+
+
+def is_known(crs: QgsCoordinateReferenceSystem) -> bool:
+    """Whether a CRS says where something lies, or that it lies nowhere; GeoPackage has some that say nothing."""
+    return bool(crs.isValid()) and crs.description() not in {"Undefined SRS", "Undefined geographic SRS"}
+
+
+def crs_text(crs: QgsCoordinateReferenceSystem) -> str:
+    """Return a CRS as PROJ reads it: its code where the whole world knows it, else its definition."""
+    if crs.authid().startswith(("EPSG:", "ESRI:", "OGC:", "IGNF:")):
+        return str(crs.authid())
+    return str(crs.toWkt(QgsCoordinateReferenceSystem.WktVariant.WKT_PREFERRED)) if crs.isValid() else ""
+
+
+def _as_text(
+    kind: str, name: str, algorithm: QgsProcessingAlgorithm, parameters: dict[str, Any], context: QgsProcessingContext
+) -> str:
+    if kind in {"number", "distance"}:
+        return repr(algorithm.parameterAsDouble(parameters, name, context))
+    if kind == "crs":
+        return crs_text(algorithm.parameterAsCrs(parameters, name, context))
+    if kind == "enum":
+        value = algorithm.parameterAsEnumString(parameters, name, context)
+        return "" if value == AUTOMATIC else str(value)
+    if kind == "file":
+        return str(algorithm.parameterAsFile(parameters, name, context))
+    return str(algorithm.parameterAsString(parameters, name, context))

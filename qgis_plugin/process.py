@@ -1,0 +1,135 @@
+"""Running a program of its own: its lines as they come, and an end within a second when the user cancels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from qgis.core import QgsFeedback
+from qgis.PyQt.QtCore import QEventLoop, QProcess, QProcessEnvironment, QTimer
+
+#: How often a cancel is looked for.
+_GLANCE_MS = 100
+
+#: How long a program that was asked to end may take before it is killed.
+_PATIENCE_MS = 700
+
+#: What would lead another Python to the libraries of the one inside QGIS, or to the user's own.
+_FOREIGN = (
+    "PYTHON",
+    "PYENV_",
+    "VIRTUAL_ENV",
+    "CONDA_",
+    "PROJ_",
+    "GDAL_",
+    "OGR_",
+    "GEOS_",
+    "CPL_",
+    "LD_LIBRARY_PATH",
+    "LD_PRELOAD",
+    "DYLD_",
+    "QT_",
+    "QML",
+    "O4W_QT_",
+    "PIP_USER",
+    "PIP_TARGET",
+    "PIP_PREFIX",
+)
+
+
+class Ended(NamedTuple):
+    """How a program ended."""
+
+    #: Exit code; a killed or crashed program has none.
+    code: int | None
+    #: Whether it was stopped because the user cancelled.
+    cancelled: bool
+    #: Why it could not be started; empty where it could.
+    not_started: str = ""
+
+    @property
+    def well(self) -> bool:
+        """Whether it did what it was asked to do."""
+        return self.code == 0 and not self.cancelled
+
+
+def clean_environment(**more: str) -> QProcessEnvironment:
+    """Return the system's environment without what is meant for the Python, GDAL, PROJ and Qt of QGIS.
+
+    Parameters
+    ----------
+    **more : str
+        Variables to set.
+    """
+    environment = QProcessEnvironment.systemEnvironment()
+    for name in environment.keys():  # noqa: SIM118 - not a dictionary
+        if name.upper().startswith(_FOREIGN):
+            environment.remove(name)
+    environment.insert("PYTHONUTF8", "1")  # what it prints is read as UTF-8, whatever the system's code page
+    for name, value in more.items():
+        environment.insert(name, value)
+    return environment
+
+
+def run_program(
+    program: str,
+    arguments: Sequence[str],
+    *,
+    environment: QProcessEnvironment,
+    feedback: QgsFeedback,
+    on_line: Callable[[str], None],
+) -> Ended:
+    """Run a program to its end, or until the user cancels.
+
+    Its standard input stays open while it may run: a program that watches it ends by itself when the user cancels,
+    or when QGIS is gone. One that has not ended 0.7 s later is killed.
+
+    Parameters
+    ----------
+    program : str
+        Path of the program.
+    arguments : sequence of str
+        Its arguments; no shell sees them.
+    environment : QProcessEnvironment
+        Its whole environment.
+    feedback : QgsFeedback
+        Asked ten times a second whether the user has cancelled.
+    on_line : callable
+        Called in this thread with each line of standard output and standard error.
+    """
+    process = QProcess()
+    process.setProcessEnvironment(environment)
+    process.setProcessChannelMode(QProcess.ProcessChannelMode.MergedChannels)
+    # The loop wakes up for these and does nothing else, so that no Python code runs inside a signal, where an
+    # exception would end QGIS.
+    loop, glance, patience = QEventLoop(), QTimer(), QTimer()
+    for signal in (process.readyRead, process.finished, process.errorOccurred, glance.timeout, patience.timeout):
+        signal.connect(loop.quit)
+    glance.start(_GLANCE_MS)
+    patience.setSingleShot(True)
+    process.start(program, list(arguments))
+    cancelled, rest = False, b""
+    while process.state() != QProcess.ProcessState.NotRunning:
+        loop.exec()
+        rest = _pass_lines(rest + process.readAll().data(), on_line)
+        if feedback.isCanceled() and not cancelled:
+            cancelled = True
+            process.closeWriteChannel()
+            patience.start(_PATIENCE_MS)
+        elif cancelled and not patience.isActive():
+            process.kill()
+    _pass_lines(rest + process.readAll().data() + b"\n", on_line)
+    if process.error() == QProcess.ProcessError.FailedToStart:
+        return Ended(None, cancelled, process.errorString())
+    crashed = process.exitStatus() != QProcess.ExitStatus.NormalExit
+    return Ended(None if crashed else process.exitCode(), cancelled)
+
+
+def _pass_lines(text: bytes, on_line: Callable[[str], None]) -> bytes:
+    """Hand on the lines that are complete and return the rest."""
+    *lines, rest = text.split(b"\n")
+    for line in lines:
+        readable = line.decode("utf-8", errors="replace").rstrip()
+        if readable:
+            on_line(readable)
+    return rest

@@ -1,0 +1,69 @@
+"""The Processing provider: its name, its algorithms, its setting, its layer styles."""
+
+from __future__ import annotations
+
+from processing.core.ProcessingConfig import ProcessingConfig, Setting
+from qgis.core import QgsProcessingProvider
+from qgis.PyQt.QtGui import QIcon
+
+from .algorithms.merge_local_maps import MergeLocalMaps
+from .algorithms.merge_network import MergeNetwork
+from .algorithms.project_local_maps import ProjectLocalMaps
+from .algorithms.set_up import SetUp
+from .environment import SETTING
+from .layout import icon_path, metadata
+from .styling import Style
+from .translation import tr
+
+
+class PolyMergeProvider(QgsProcessingProvider):
+    """The provider ``polymerge``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        # QGIS styles layers after the algorithm is gone; somebody has to keep the styles until then.
+        self._styles: dict[str, Style] = {}
+
+    def id(self) -> str:
+        """Return the id of the provider; it never changes."""
+        return "polymerge"
+
+    def name(self) -> str:
+        """Return the name in the toolbox."""
+        return "PolyMerge"
+
+    def longName(self) -> str:
+        """Return the name with the version."""
+        return f"PolyMerge {metadata('version')}"
+
+    def icon(self) -> QIcon:
+        """Return the icon in the toolbox."""
+        return QIcon(icon_path("polymerge"))
+
+    def svgIconPath(self) -> str:
+        """Return the icon for models."""
+        return icon_path("polymerge")
+
+    def load(self) -> bool:
+        """Add the setting and the algorithms."""
+        ProcessingConfig.settingIcons[self.name()] = self.icon()
+        description = tr("Python that PolyMerge runs in (empty: the one that “Set up PolyMerge” makes)")
+        ProcessingConfig.addSetting(Setting(self.name(), SETTING, description, "", valuetype=Setting.FILE))
+        ProcessingConfig.readSettings()
+        self.refreshAlgorithms()
+        return True
+
+    def unload(self) -> None:
+        """Take the setting away."""
+        ProcessingConfig.removeSetting(SETTING)
+
+    def loadAlgorithms(self) -> None:
+        """Add the algorithms."""
+        for algorithm in (SetUp, ProjectLocalMaps, MergeLocalMaps, MergeNetwork):
+            self.addAlgorithm(algorithm())
+
+    def style(self, name: str) -> Style:
+        """Return a layer style, as something that QGIS calls when it has loaded a layer."""
+        if name not in self._styles:
+            self._styles[name] = Style(name)
+        return self._styles[name]

@@ -1,0 +1,79 @@
+<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
+<qgis version="3.22.0" styleCategories="Symbology|Fields|AttributeTable">
+  <renderer-v2 type="categorizedSymbol" symbollevels="0" referencescale="-1" enableorderby="0" attr="class" forceraster="0">
+    <categories>
+      <category label="Pedestrian crossing" value="ped_crossing" render="true" symbol="0" />
+      <category label="Divider" value="divider" render="true" symbol="1" />
+      <category label="Boundary" value="boundary" render="true" symbol="2" />
+      <category label="Other class" value="" render="true" symbol="3" />
+    </categories>
+    <symbols>
+      <symbol type="line" clip_to_extent="1" name="0" force_rhr="0" alpha="0.6">
+        <layer locked="0" class="SimpleLine" pass="0" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="round" name="capstyle" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="0,114,178,255" name="line_color" />
+            <Option type="QString" value="solid" name="line_style" />
+            <Option type="QString" value="0.35" name="line_width" />
+            <Option type="QString" value="MM" name="line_width_unit" />
+          </Option>
+        </layer>
+      </symbol>
+      <symbol type="line" clip_to_extent="1" name="1" force_rhr="0" alpha="0.6">
+        <layer locked="0" class="SimpleLine" pass="0" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="round" name="capstyle" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="213,94,0,255" name="line_color" />
+            <Option type="QString" value="solid" name="line_style" />
+            <Option type="QString" value="0.35" name="line_width" />
+            <Option type="QString" value="MM" name="line_width_unit" />
+          </Option>
+        </layer>
+      </symbol>
+      <symbol type="line" clip_to_extent="1" name="2" force_rhr="0" alpha="0.6">
+        <layer locked="0" class="SimpleLine" pass="0" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="round" name="capstyle" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="0,158,115,255" name="line_color" />
+            <Option type="QString" value="solid" name="line_style" />
+            <Option type="QString" value="0.35" name="line_width" />
+            <Option type="QString" value="MM" name="line_width_unit" />
+          </Option>
+        </layer>
+      </symbol>
+      <symbol type="line" clip_to_extent="1" name="3" force_rhr="0" alpha="0.6">
+        <layer locked="0" class="SimpleLine" pass="0" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="round" name="capstyle" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="204,121,167,255" name="line_color" />
+            <Option type="QString" value="solid" name="line_style" />
+            <Option type="QString" value="0.35" name="line_width" />
+            <Option type="QString" value="MM" name="line_width_unit" />
+          </Option>
+        </layer>
+      </symbol>
+    </symbols>
+  </renderer-v2>
+  <aliases>
+    <alias name="Class" field="class" />
+    <alias name="Drive" field="drive" />
+    <alias name="Instance" field="instance" />
+    <alias name="Score" field="score" />
+    <alias name="Timestamp" field="timestamp" />
+  </aliases>
+  <attributetableconfig actionWidgetStyle="dropDown" sortOrder="0" sortExpression="">
+    <columns>
+      <column type="field" name="class" hidden="0" width="-1" />
+      <column type="field" name="drive" hidden="0" width="-1" />
+      <column type="field" name="instance" hidden="0" width="-1" />
+      <column type="field" name="score" hidden="0" width="-1" />
+      <column type="field" name="timestamp" hidden="0" width="-1" />
+      <column type="actions" hidden="1" width="-1" />
+    </columns>
+  </attributetableconfig>
+  <layerGeometryType>1</layerGeometryType>
+</qgis>

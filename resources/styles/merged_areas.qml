@@ -1,0 +1,88 @@
+<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
+<qgis version="3.22.0" styleCategories="Symbology|Fields|AttributeTable">
+  <renderer-v2 type="categorizedSymbol" symbollevels="0" referencescale="-1" enableorderby="0" attr="class" forceraster="0">
+    <categories>
+      <category label="Pedestrian crossing" value="ped_crossing" render="true" symbol="0" />
+      <category label="Divider" value="divider" render="true" symbol="1" />
+      <category label="Boundary" value="boundary" render="true" symbol="2" />
+      <category label="Other class" value="" render="true" symbol="3" />
+    </categories>
+    <symbols>
+      <symbol type="fill" clip_to_extent="1" name="0" force_rhr="0" alpha="1">
+        <layer locked="0" class="SimpleFill" pass="0" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="0,114,178,89" name="color" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="0,114,178,255" name="outline_color" />
+            <Option type="QString" value="solid" name="outline_style" />
+            <Option type="QString" value="0.6" name="outline_width" />
+            <Option type="QString" value="MM" name="outline_width_unit" />
+            <Option type="QString" value="solid" name="style" />
+          </Option>
+        </layer>
+      </symbol>
+      <symbol type="fill" clip_to_extent="1" name="1" force_rhr="0" alpha="1">
+        <layer locked="0" class="SimpleFill" pass="0" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="213,94,0,89" name="color" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="213,94,0,255" name="outline_color" />
+            <Option type="QString" value="solid" name="outline_style" />
+            <Option type="QString" value="0.6" name="outline_width" />
+            <Option type="QString" value="MM" name="outline_width_unit" />
+            <Option type="QString" value="solid" name="style" />
+          </Option>
+        </layer>
+      </symbol>
+      <symbol type="fill" clip_to_extent="1" name="2" force_rhr="0" alpha="1">
+        <layer locked="0" class="SimpleFill" pass="0" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="0,158,115,89" name="color" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="0,158,115,255" name="outline_color" />
+            <Option type="QString" value="solid" name="outline_style" />
+            <Option type="QString" value="0.6" name="outline_width" />
+            <Option type="QString" value="MM" name="outline_width_unit" />
+            <Option type="QString" value="solid" name="style" />
+          </Option>
+        </layer>
+      </symbol>
+      <symbol type="fill" clip_to_extent="1" name="3" force_rhr="0" alpha="1">
+        <layer locked="0" class="SimpleFill" pass="0" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="204,121,167,89" name="color" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="204,121,167,255" name="outline_color" />
+            <Option type="QString" value="solid" name="outline_style" />
+            <Option type="QString" value="0.6" name="outline_width" />
+            <Option type="QString" value="MM" name="outline_width_unit" />
+            <Option type="QString" value="solid" name="style" />
+          </Option>
+        </layer>
+      </symbol>
+    </symbols>
+  </renderer-v2>
+  <aliases>
+    <alias name="Element" field="element_id" />
+    <alias name="Class" field="class" />
+    <alias name="Score" field="score" />
+    <alias name="Observations" field="n_observations" />
+    <alias name="Instances" field="n_instances" />
+    <alias name="Length (m)" field="length_m" />
+    <alias name="Sigma (m)" field="sigma_m" />
+  </aliases>
+  <attributetableconfig actionWidgetStyle="dropDown" sortOrder="0" sortExpression="&quot;element_id&quot;">
+    <columns>
+      <column type="field" name="element_id" hidden="0" width="-1" />
+      <column type="field" name="class" hidden="0" width="-1" />
+      <column type="field" name="score" hidden="0" width="-1" />
+      <column type="field" name="n_observations" hidden="0" width="-1" />
+      <column type="field" name="n_instances" hidden="0" width="-1" />
+      <column type="field" name="length_m" hidden="0" width="-1" />
+      <column type="field" name="sigma_m" hidden="0" width="-1" />
+      <column type="field" name="fid" hidden="1" width="-1" />
+      <column type="actions" hidden="1" width="-1" />
+    </columns>
+  </attributetableconfig>
+  <layerGeometryType>2</layerGeometryType>
+</qgis>
