@@ -112,7 +112,7 @@ def deliver(
     if not is_there:
         layer = _open(file, result.like)
     kept = [n for n, field in enumerate(layer.fields()) if n not in layer.primaryKeyAttributes()]
-    fields = _named_fields([layer.fields()[n] for n in kept], _is_shapefile(parameters.get(result.parameter)))
+    fields = _named_fields([layer.fields()[n] for n in kept], destination_text(parameters.get(result.parameter)))
     known = is_there and layer.wkbType() != QgsWkbTypes.Type.Unknown
     kind = layer.wkbType() if known else _WKB_TYPES[result.kind]
     sink, destination = algorithm.parameterAsSink(parameters, result.parameter, context, fields, kind, layer.crs())
@@ -133,15 +133,15 @@ def _open(file: Path, layer: str) -> QgsVectorLayer:
     return QgsVectorLayer(f"{file}|layername={layer}", layer, "ogr", options)
 
 
-def _is_shapefile(destination: Any) -> bool:
-    """Whether the user wants a Shapefile."""
-    if isinstance(destination, QgsProcessingOutputLayerDefinition):
-        destination = destination.sink.staticValue()
-    return str(destination or "").lower().endswith(".shp")
+def destination_text(value: Any) -> str:
+    """Return what the user gave as a destination: a file, a table of a database, or a word for a temporary layer."""
+    if isinstance(value, QgsProcessingOutputLayerDefinition):
+        value = value.sink.staticValue()
+    return str(value or "")
 
 
-def _named_fields(wanted: list[QgsField], shapefile: bool) -> QgsFields:  # noqa: FBT001 - private
-    fields = QgsFields()
+def _named_fields(wanted: list[QgsField], destination: str) -> QgsFields:
+    fields, shapefile = QgsFields(), destination.lower().endswith(".shp")
     for field in wanted:
         short = _SHAPEFILE_NAMES.get(field.name(), field.name()) if shapefile else field.name()
         fields.append(QgsField(short, field.type()))

@@ -63,7 +63,7 @@ def run_worker(command: str, arguments: Sequence[str], part: Part, *, shown_as: 
         feedback=part.feedback,
         on_line=listener.hear,
     )
-    if ended.cancelled:
+    if part.feedback.isCanceled():  # Ctrl-C in a terminal may have reached the worker first
         raise QgsProcessingException(tr("Cancelled; nothing was written."))
     if not ended.well:
         raise QgsProcessingException(listener.error or _unforeseen(ended, python, listener.others))

@@ -22,7 +22,7 @@ from ..environment import EnvironmentMissing, worker_python
 from ..layout import icon_path, metadata
 from ..parameters import explained, option_arguments
 from ..progress import Part
-from ..results import Result, deliver
+from ..results import Result, deliver, destination_text
 from ..translation import tr
 from ..worker import run_worker, workspace
 
@@ -126,6 +126,43 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
     def results(self) -> list[Result]:
         """Return the layers that come out."""
         return []
+
+    def files_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[str]:
+        """Return the files that a run reads."""
+        del parameters, context
+        return []
+
+    def fault(self, parameters: Parameters, context: QgsProcessingContext) -> str:
+        """Return what is wrong with the parameters, in a sentence; empty where nothing is."""
+        taken = {Path(file).resolve(): tr("a file that is read") for file in self.files_read(parameters, context)}
+        outputs = {result.parameter: result.title for result in self.results()} | {"REPORT": tr("Report")}
+        for name, title in outputs.items():
+            file = Path(destination_text(parameters.get(name)))
+            if not file.suffix:
+                continue  # a temporary layer, or a table of a database
+            if file.resolve() in taken:
+                return tr("{} would overwrite {}, {}: choose another file.").format(
+                    title, taken[file.resolve()], file.name
+                )
+            taken[file.resolve()] = tr("the output {}").format(title)
+        return ""
+
+    def checkParameterValues(self, parameters: Parameters, context: QgsProcessingContext) -> tuple[bool, str]:
+        """Say what is wrong with the parameters before anything runs."""
+        fine, message = super().checkParameterValues(parameters, context)
+        if fine:
+            message = self.fault(parameters, context)
+        return not message, message
+
+    def prepareAlgorithm(
+        self, parameters: Parameters, context: QgsProcessingContext, feedback: QgsProcessingFeedback
+    ) -> bool:
+        """Look at the parameters again: a model does not ask `checkParameterValues` of its steps."""
+        del feedback
+        message = self.fault(parameters, context)
+        if message:
+            raise QgsProcessingException(message)
+        return True
 
     def stage(self, parameters: Parameters, context: QgsProcessingContext, folder: Path, part: Part) -> Staged:
         """Put what the worker reads into a folder where it is not in files yet."""

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from qgis.core import (
     QgsProcessingContext,
-    QgsProcessingException,
     QgsProcessingFeedback,
     QgsVectorLayer,
     QgsWkbTypes,
@@ -48,22 +47,11 @@ class LayerAlgorithm(WorkerAlgorithm):
         self._layers: list[Input] = []
         self._main_map: dict[str, Input] = {}
 
-    def checkParameterValues(self, parameters: Parameters, context: QgsProcessingContext) -> tuple[bool, str]:
-        """Say what is wrong with the inputs before anything runs."""
-        fine, message = super().checkParameterValues(parameters, context)
-        if not fine:
-            return fine, message
-        fault = self._fault(parameters, context)
-        return not fault, fault
-
     def prepareAlgorithm(
         self, parameters: Parameters, context: QgsProcessingContext, feedback: QgsProcessingFeedback
     ) -> bool:
         """Take the layers as they are now; this runs in the thread of the project."""
-        del feedback
-        fault = self._fault(parameters, context)  # a model does not ask checkParameterValues of its steps
-        if fault:
-            raise QgsProcessingException(fault)
+        super().prepareAlgorithm(parameters, context, feedback)
         selected = self.parameterAsBoolean(parameters, "SELECTED_ONLY", context)
         layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
         self._layers = [layer_input(layer, selected_only=selected) for layer in layers]
@@ -92,8 +80,17 @@ class LayerAlgorithm(WorkerAlgorithm):
             stage_layer(given, file, layer, next(pieces), spatial=layer != _ALIASES)
         return Staged([f"--main-map={file}"], inputs, {**titles, str(file): f"“{title}”"})
 
-    def _fault(self, parameters: Parameters, context: QgsProcessingContext) -> str:
+    def files_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[str]:
+        """Return the files of the layers that lie in files."""
+        layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
+        layers += [self.parameterAsVectorLayer(parameters, name, context) for name in _MAIN_MAP]
+        return [layer.source().split("|")[0] for layer in layers if layer is not None]
+
+    def fault(self, parameters: Parameters, context: QgsProcessingContext) -> str:
         """Return what is wrong with the layers, as far as QGIS can know."""
+        fault = super().fault(parameters, context)
+        if fault:
+            return fault
         layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
         given = parameters.get("LOCAL_MAPS")
         if isinstance(given, (list, tuple)) and len(layers) < len(given):

@@ -81,15 +81,17 @@ class ProjectLocalMaps(WorkerAlgorithm):
             text_parameter("DRIVE", tr("Name of the drive"), tr("Empty: the name of the predictions' file.")),
         ]
 
-    def checkParameterValues(self, parameters: Parameters, context: QgsProcessingContext) -> tuple[bool, str]:
+    def files_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[str]:
+        """Return the predictions, the poses and the matrix."""
+        files = [self.parameterAsFile(parameters, name, context) for name in ("PREDICTIONS", "POSES", "LIDAR_TO_EGO")]
+        return [file for file in files if file]
+
+    def fault(self, parameters: Parameters, context: QgsProcessingContext) -> str:
         """Ask for a CRS, or for the word that there is none."""
-        fine, message = super().checkParameterValues(parameters, context)
         has_crs = self.parameterAsCrs(parameters, "CRS", context).isValid()
-        if fine and has_crs == self.parameterAsBoolean(parameters, "LOCAL_CRS", context):
-            return False, tr(
-                "Choose a CRS of the result, or tick “Plain metres without a CRS”: one of the two, not both."
-            )
-        return fine, message
+        if has_crs == self.parameterAsBoolean(parameters, "LOCAL_CRS", context):
+            return tr("Choose a CRS of the result, or tick “Plain metres without a CRS”: one of the two, not both.")
+        return super().fault(parameters, context)
 
     def stage(self, parameters: Parameters, context: QgsProcessingContext, folder: Path, part: Part) -> Staged:
         """Name the files, which the worker reads itself."""
