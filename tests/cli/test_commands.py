@@ -409,6 +409,12 @@ def test_a_layer_is_named_as_qgis_names_it(run, tmp_path):
     assert set(look(tmp_path / "all.gpkg", "lineage")["source"]) == {"monday", "tuesday"}
 
 
+def test_a_file_may_be_called_as_the_layer_that_project_writes(run, tmp_path):
+    roads = draw(tmp_path / "local_maps.gpkg", noisy_copies(2, 4))
+    assert run("merge", roads, "-o", tmp_path / "merged.gpkg").code == 0
+    assert set(look(tmp_path / "merged.gpkg", "lineage")["source"]) == {"local_maps"}
+
+
 def test_a_path_with_spaces_umlauts_and_quotes(run, tmp_path):
     folder = tmp_path / "Straße 'Mitte' (neu)"
     folder.mkdir()
