@@ -100,3 +100,8 @@ $(QGIS_VENV)/test: | qgis
 	$(call venv,$(QGIS_PYTHON),$(QGIS_VENV),--system-site-packages)
 	$(QGIS_VENV)/bin/python -m pip install --quiet "pytest>=8" "pytest-qgis>=3" "pytest-cov>=5"
 	touch $@
+
+# The pictures of docs/qgis.md, taken in the desktop of QGIS.
+.PHONY: screenshots
+screenshots: $(VENV)/runtime qgis
+	$(BIN)/python -m tests.qgis.desktop.desktop docs/images

@@ -19,12 +19,12 @@ from qgis.core import (
     QgsProcessingParameterDefinition,
     QgsProcessingParameterDistance,
     QgsProcessingParameterEnum,
-    QgsProcessingParameterFeatureSource,
     QgsProcessingParameterField,
     QgsProcessingParameterFile,
     QgsProcessingParameterMultipleLayers,
     QgsProcessingParameterNumber,
     QgsProcessingParameterString,
+    QgsProcessingParameterVectorLayer,
     QgsUnitTypes,
 )
 
@@ -49,6 +49,12 @@ def explained(definition: _Definition, text: str, *, advanced: bool = False) -> 
     return definition
 
 
+def with_decimals(definition: _Definition) -> _Definition:
+    """Have a number shown with two decimals instead of six."""
+    definition.setMetadata({"widget_wrapper": {"decimals": 2}})
+    return definition
+
+
 def layer_parameters() -> list[QgsProcessingParameterDefinition]:
     """Return what merging and looking at the network read, and how near is near."""
     layers = QgsProcessingParameterMultipleLayers("LOCAL_MAPS", tr("Layers to merge"), layerType=_ANY)
@@ -67,19 +73,19 @@ def layer_parameters() -> list[QgsProcessingParameterDefinition]:
         ),
         switch_parameter(
             "SELECTED_ONLY",
-            tr("Selected features only"),
+            tr("Selected features of these layers only"),
             tr("Of layers with a selection, take the selected features; of the others all."),
             advanced=False,
         ),
         explained(
-            proximity,
+            with_decimals(proximity),
             tr(
                 "Lines that come nearer to each other than this are taken for the same element. In metres on the "
                 "ground, whatever the CRS of the layers; at most 1000 m."
             ),
         ),
         explained(
-            QgsProcessingParameterFeatureSource("MAIN_MAP", tr("Main map"), types=[_LINES, _AREAS], optional=True),
+            QgsProcessingParameterVectorLayer("MAIN_MAP", tr("Main map"), types=[_LINES, _AREAS], optional=True),
             tr("An earlier result to merge into; its elements keep their ids."),
         ),
     ]
@@ -112,13 +118,15 @@ def column_parameters() -> list[QgsProcessingParameterDefinition]:
         ),
         _field("SCORE_FIELD", tr("Score column"), tr("Confidence from 0 to 1. Empty: score, if any; else 1.")),
         explained(
-            QgsProcessingParameterNumber(
-                "MIN_SCORE",
-                tr("Lowest score"),
-                type=QgsProcessingParameterNumber.Type.Double,
-                defaultValue=0.0,
-                minValue=0.0,
-                maxValue=1.0,
+            with_decimals(
+                QgsProcessingParameterNumber(
+                    "MIN_SCORE",
+                    tr("Lowest score"),
+                    type=QgsProcessingParameterNumber.Type.Double,
+                    defaultValue=0.0,
+                    minValue=0.0,
+                    maxValue=1.0,
+                )
             ),
             tr("Features with a lower score are left out, and listed there."),
             advanced=True,
@@ -136,14 +144,14 @@ def map_parameters() -> list[QgsProcessingParameterDefinition]:
     """Return the rest of a main map, the CRS, and what to do with bad features."""
     return [
         explained(
-            QgsProcessingParameterFeatureSource(
+            QgsProcessingParameterVectorLayer(
                 "MAIN_MAP_AREAS", tr("Areas of the main map"), types=[_AREAS], optional=True
             ),
             tr("Where the main map has its areas in a layer of their own."),
             advanced=True,
         ),
         explained(
-            QgsProcessingParameterFeatureSource(
+            QgsProcessingParameterVectorLayer(
                 "MAIN_MAP_ALIASES", tr("Retired ids of the main map"), types=[_TABLE], optional=True
             ),
             tr("The table of retired ids that came with the main map, so that no id is ever given twice."),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from processing.core.ProcessingConfig import ProcessingConfig, Setting
 from qgis.core import QgsProcessingProvider
+from qgis.PyQt import sip
 from qgis.PyQt.QtGui import QIcon
 
 from .algorithms.merge_local_maps import MergeLocalMaps
@@ -21,8 +22,7 @@ class PolyMergeProvider(QgsProcessingProvider):
 
     def __init__(self) -> None:
         super().__init__()
-        # QGIS styles layers after the algorithm is gone; somebody has to keep the styles until then.
-        self._styles: dict[str, Style] = {}
+        self._styles: list[Style] = []
 
     def id(self) -> str:
         """Return the id of the provider; it never changes."""
@@ -64,6 +64,7 @@ class PolyMergeProvider(QgsProcessingProvider):
 
     def style(self, name: str) -> Style:
         """Return a layer style, as something that QGIS calls when it has loaded a layer."""
-        if name not in self._styles:
-            self._styles[name] = Style(name)
-        return self._styles[name]
+        # QGIS calls it when the algorithm is gone, and deletes it after the run; until then somebody has to keep it.
+        self._styles = [style for style in self._styles if not sip.isdeleted(style)]
+        self._styles.append(Style(name))
+        return self._styles[-1]

@@ -18,10 +18,12 @@ from qgis.core import (
     QgsProcessingException,
     QgsProcessingOutputLayerDefinition,
     QgsProcessingParameterFeatureSink,
+    QgsProviderRegistry,
     QgsVectorLayer,
     QgsWkbTypes,
 )
 
+from .parameters import explained
 from .translation import tr
 
 _CHUNK = 2000
@@ -84,8 +86,7 @@ class Result(NamedTuple):
         sink = QgsProcessingParameterFeatureSink(
             self.parameter, self.title, _SOURCE_TYPES[self.kind], None, self.optional, self.wanted
         )
-        sink.setHelp(self.help)
-        return sink
+        return explained(sink, self.help, advanced=not self.wanted)
 
 
 def deliver(
@@ -107,17 +108,15 @@ def deliver(
     QgsProcessingException
         If the sink cannot be made or written to.
     """
-    layer = _open(file, result.layer)
-    is_there = layer.isValid()
-    if not is_there:
-        layer = _open(file, result.like)
+    is_there = result.layer in _layer_names(file)
+    layer = _open(file, result.layer if is_there else result.like)
     kept = [n for n, field in enumerate(layer.fields()) if n not in layer.primaryKeyAttributes()]
     fields = _named_fields([layer.fields()[n] for n in kept], destination_text(parameters.get(result.parameter)))
     known = is_there and layer.wkbType() != QgsWkbTypes.Type.Unknown
     kind = layer.wkbType() if known else _WKB_TYPES[result.kind]
     sink, destination = algorithm.parameterAsSink(parameters, result.parameter, context, fields, kind, layer.crs())
     if sink is None:
-        if result.optional and not parameters.get(result.parameter):
+        if result.optional and not destination_text(parameters.get(result.parameter)):
             return {}
         raise QgsProcessingException(algorithm.invalidSinkError(parameters, result.parameter))
     if is_there:
@@ -125,6 +124,11 @@ def deliver(
     del sink  # closes a file
     _prepare_loading(result, destination, context, empty=not (is_there and layer.featureCount()), algorithm=algorithm)
     return {result.parameter: destination}
+
+
+def _layer_names(file: Path) -> list[str]:
+    metadata = QgsProviderRegistry.instance().providerMetadata("ogr")
+    return [each.name() for each in metadata.querySublayers(str(file))]
 
 
 def _open(file: Path, layer: str) -> QgsVectorLayer:

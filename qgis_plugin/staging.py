@@ -25,7 +25,6 @@ from qgis.core import (
     QgsField,
     QgsFields,
     QgsProcessingException,
-    QgsProcessingFeatureSource,
     QgsVectorFileWriter,
     QgsVectorLayer,
     QgsVectorLayerFeatureSource,
@@ -73,16 +72,6 @@ def layer_input(layer: QgsVectorLayer, *, selected_only: bool = False) -> Input:
 
     count = len(chosen) or layer.featureCount()
     return Input(layer.name(), crs_of(layer), layer.fields(), read, count, id_column(layer))
-
-
-def source_input(source: QgsProcessingFeatureSource, layer: QgsVectorLayer | None) -> Input:
-    """Take a source of Processing, which knows of selections itself, and the layer that it comes from."""
-
-    def read(request: QgsFeatureRequest) -> QgsFeatureIterator:
-        return source.getFeatures(request, QgsProcessingFeatureSource.Flag.FlagSkipGeometryValidityChecks)
-
-    name, own = source.sourceName(), "" if layer is None else id_column(layer)
-    return Input(name, source.sourceCrs(), source.fields(), read, source.featureCount(), own)
 
 
 def crs_of(layer: QgsVectorLayer) -> QgsCoordinateReferenceSystem:

@@ -86,6 +86,8 @@ class _Listener:
         for path, title in self._shown_as.items():
             line = line.replace(path, title)
         kind, _, text = line.partition(": ")
+        if self._feedback.isCanceled():
+            return  # the user knows, and hears the end of it from us
         if kind == "error":
             self.error = text
         elif kind == "warning":

@@ -184,7 +184,7 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
         report = QgsProcessingParameterFileDestination(
             "REPORT", tr("Report"), fileFilter="JSON (*.json)", optional=True, createByDefault=False
         )
-        self.addParameter(explained(report, tr("Counts and settings of the run as JSON.")))
+        self.addParameter(explained(report, tr("Counts and settings of the run as JSON."), advanced=True))
         for name, title in self.NUMBERS:
             self.addOutput(QgsProcessingOutputNumber(name, tr(title)))
 

@@ -13,7 +13,7 @@ from qgis.core import (
 
 from ..parameters import is_known
 from ..progress import Part
-from ..staging import Input, crs_of, file_names, layer_input, source_input, stage_layer
+from ..staging import Input, crs_of, file_names, layer_input, stage_layer
 from ..translation import tr
 from .base import Parameters, Staged, WorkerAlgorithm
 
@@ -56,10 +56,9 @@ class LayerAlgorithm(WorkerAlgorithm):
         layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
         self._layers = [layer_input(layer, selected_only=selected) for layer in layers]
         for name, part in _MAIN_MAP.items():
-            source = self.parameterAsSource(parameters, name, context)
-            if source is not None:
-                layer = self.parameterAsVectorLayer(parameters, name, context)
-                self._main_map[part] = source_input(source, layer)
+            layer = self.parameterAsVectorLayer(parameters, name, context)
+            if layer is not None:
+                self._main_map[part] = layer_input(layer)
         return True
 
     def stage(self, parameters: Parameters, context: QgsProcessingContext, folder: Path, part: Part) -> Staged:

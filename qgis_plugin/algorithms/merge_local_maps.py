@@ -13,6 +13,7 @@ from ..parameters import (
     layer_parameters,
     map_parameters,
     text_parameter,
+    with_decimals,
 )
 from ..results import Result
 from ..translation import mark, tr
@@ -54,7 +55,7 @@ class MergeLocalMaps(LayerAlgorithm):
             *column_parameters(),
             choice_parameter("METHOD", tr("Method"), tr("polymerge: the method as it was published."), ("polymerge",)),
             explained(
-                coverage,
+                with_decimals(coverage),
                 tr("The share of the observations of an area that must cover a place for it to belong to the area."),
                 advanced=True,
             ),

@@ -2,14 +2,14 @@
 <qgis version="3.22.0" styleCategories="Symbology|Fields|AttributeTable">
   <renderer-v2 type="singleSymbol" symbollevels="0" referencescale="-1" enableorderby="0" forceraster="0">
     <symbols>
-      <symbol type="fill" clip_to_extent="1" name="0" force_rhr="0" alpha="0.5">
+      <symbol type="fill" clip_to_extent="1" name="0" force_rhr="0" alpha="1">
         <layer locked="0" class="SimpleFill" pass="0" enabled="1">
           <Option type="Map">
             <Option type="QString" value="0,0,255,255" name="color" />
             <Option type="QString" value="miter" name="joinstyle" />
-            <Option type="QString" value="128,128,128,255" name="outline_color" />
+            <Option type="QString" value="110,110,110,255" name="outline_color" />
             <Option type="QString" value="solid" name="outline_style" />
-            <Option type="QString" value="0.2" name="outline_width" />
+            <Option type="QString" value="0.3" name="outline_width" />
             <Option type="QString" value="MM" name="outline_width_unit" />
             <Option type="QString" value="no" name="style" />
           </Option>
@@ -19,7 +19,7 @@
   </renderer-v2>
   <aliases>
     <alias name="Drive" field="drive" />
-    <alias name="Instance" field="instance" />
+    <alias name="Local map" field="instance" />
     <alias name="Timestamp (ns)" field="timestamp_ns" />
     <alias name="X" field="x" />
     <alias name="Y" field="y" />

@@ -1,10 +1,39 @@
 <!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
-<qgis version="3.22.0" styleCategories="Symbology|Fields|AttributeTable">
+<qgis version="3.22.0" styleCategories="Symbology|Fields|Forms|AttributeTable">
+  <fieldConfiguration>
+    <field name="from_m" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+    <field name="to_m" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+    <field name="weight" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="3" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+  </fieldConfiguration>
   <aliases>
     <alias name="Source" field="source" />
     <alias name="Source feature" field="source_fid" />
     <alias name="Drive" field="drive" />
-    <alias name="Instance" field="instance" />
+    <alias name="Local map" field="instance" />
     <alias name="Element" field="element_id" />
     <alias name="From (m)" field="from_m" />
     <alias name="To (m)" field="to_m" />

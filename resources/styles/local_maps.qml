@@ -1,5 +1,5 @@
 <!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
-<qgis version="3.22.0" styleCategories="Symbology|Fields|AttributeTable">
+<qgis version="3.22.0" styleCategories="Symbology|Fields|Forms|AttributeTable">
   <renderer-v2 type="categorizedSymbol" symbollevels="0" referencescale="-1" enableorderby="0" attr="class" forceraster="0">
     <categories>
       <category label="Pedestrian crossing" value="ped_crossing" render="true" symbol="0" />
@@ -58,10 +58,21 @@
       </symbol>
     </symbols>
   </renderer-v2>
+  <fieldConfiguration>
+    <field name="score" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+  </fieldConfiguration>
   <aliases>
     <alias name="Class" field="class" />
     <alias name="Drive" field="drive" />
-    <alias name="Instance" field="instance" />
+    <alias name="Local map" field="instance" />
     <alias name="Score" field="score" />
     <alias name="Timestamp" field="timestamp" />
   </aliases>

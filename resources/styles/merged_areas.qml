@@ -1,5 +1,5 @@
 <!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
-<qgis version="3.22.0" styleCategories="Symbology|Fields|AttributeTable">
+<qgis version="3.22.0" styleCategories="Symbology|Fields|Forms|AttributeTable">
   <renderer-v2 type="categorizedSymbol" symbollevels="0" referencescale="-1" enableorderby="0" attr="class" forceraster="0">
     <categories>
       <category label="Pedestrian crossing" value="ped_crossing" render="true" symbol="0" />
@@ -62,12 +62,44 @@
       </symbol>
     </symbols>
   </renderer-v2>
+  <fieldConfiguration>
+    <field name="score" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+    <field name="length_m" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+    <field name="sigma_m" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+  </fieldConfiguration>
   <aliases>
     <alias name="Element" field="element_id" />
     <alias name="Class" field="class" />
     <alias name="Score" field="score" />
     <alias name="Observations" field="n_observations" />
-    <alias name="Instances" field="n_instances" />
+    <alias name="Local maps" field="n_instances" />
+    <alias name="Element" field="elem_id" />
+    <alias name="Observations" field="n_obs" />
+    <alias name="Local maps" field="n_inst" />
     <alias name="Length (m)" field="length_m" />
     <alias name="Sigma (m)" field="sigma_m" />
   </aliases>

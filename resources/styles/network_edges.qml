@@ -1,5 +1,5 @@
 <!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
-<qgis version="3.22.0" styleCategories="Symbology|Fields|AttributeTable">
+<qgis version="3.22.0" styleCategories="Symbology|Fields|Forms|AttributeTable">
   <renderer-v2 type="singleSymbol" symbollevels="0" referencescale="-1" enableorderby="0" forceraster="0">
     <symbols>
       <symbol type="line" clip_to_extent="1" name="0" force_rhr="0" alpha="1">
@@ -16,6 +16,17 @@
       </symbol>
     </symbols>
   </renderer-v2>
+  <fieldConfiguration>
+    <field name="distance_m" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+  </fieldConfiguration>
   <aliases>
     <alias name="From observation" field="from_observation" />
     <alias name="To observation" field="to_observation" />

@@ -36,7 +36,7 @@
     <alias name="Source" field="source" />
     <alias name="Source feature" field="source_fid" />
     <alias name="Drive" field="drive" />
-    <alias name="Instance" field="instance" />
+    <alias name="Local map" field="instance" />
   </aliases>
   <attributetableconfig actionWidgetStyle="dropDown" sortOrder="0" sortExpression="">
     <columns>

@@ -29,11 +29,14 @@ STYLES = sorted((ROOT / "resources" / "styles").glob("*.qml"))
 ICONS = sorted((ROOT / "resources" / "icons").glob("*.svg"))
 LARGEST_UPLOAD = 25_000_000
 
+#: The columns of the merged map, and what three of them are called in a Shapefile.
+ELEMENTS = {*schema.ELEMENT_COLUMNS, "elem_id", "n_obs", "n_inst"}
+
 COLUMNS = {
     "local_maps": {"class", "drive", "instance", "score", "timestamp"},
     "instances": {"drive", "instance", "timestamp_ns", "x", "y", "heading", "n_observations"},
-    "merged_map": set(schema.ELEMENT_COLUMNS),
-    "merged_areas": set(schema.ELEMENT_COLUMNS),
+    "merged_map": ELEMENTS,
+    "merged_areas": ELEMENTS,
     "network_observations": {"observation", "source", "source_fid", "drive", "instance", "class", "component"},
     "network_edges": {"from_observation", "to_observation", "class", "component", "distance_m"},
     "lineage": set(schema.LINEAGE_COLUMNS),
