@@ -54,7 +54,8 @@ def lacking(requirements: Path) -> str:
 
 def numbers(version: str) -> tuple[int, ...]:
     """Return the numbers of a version, without what follows them: 2.1.0rc1 is 2.1.0."""
-    return tuple(int(part) for part in re.sub(r"[^\d.].*", "", version).split(".") if part)
+    release = re.sub(r"[^\d.].*", "", version)
+    return tuple(int(part) for part in re.sub(r"(\.0*)+$", "", release).split(".") if part)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ What a parameter is called says how it goes to the command line, so that nothing
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
@@ -264,6 +265,14 @@ def option_arguments(
 REPEATED = frozenset({"AREA", "AGGREGATE"})
 
 
+def absolute_file(
+    algorithm: QgsProcessingAlgorithm, parameters: dict[str, Any], name: str, context: QgsProcessingContext
+) -> str:
+    """Return the whole path of a file, which is to be found from any folder; empty where there is none."""
+    file = algorithm.parameterAsFile(parameters, name, context)
+    return os.path.abspath(file) if file else ""  # noqa: PTH100 - links stay as they are: they lead to environments
+
+
 def is_known(crs: QgsCoordinateReferenceSystem) -> bool:
     """Whether a CRS says where something lies, or that it lies nowhere; GeoPackage has some that say nothing."""
     return bool(crs.isValid()) and crs.description() not in {"Undefined SRS", "Undefined geographic SRS"}
@@ -287,5 +296,5 @@ def _as_text(
         value = algorithm.parameterAsEnumString(parameters, name, context)
         return "" if value == AUTOMATIC else str(value)
     if kind == "file":
-        return str(algorithm.parameterAsFile(parameters, name, context))
+        return absolute_file(algorithm, parameters, name, context)
     return str(algorithm.parameterAsString(parameters, name, context))

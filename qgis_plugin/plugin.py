@@ -15,8 +15,9 @@ class PolyMergePlugin:
 
     def initProcessing(self) -> None:
         """Add the provider; all that ``qgis_process`` calls."""
-        self._provider = PolyMergeProvider()
-        QgsApplication.processingRegistry().addProvider(self._provider)
+        provider = PolyMergeProvider()
+        if QgsApplication.processingRegistry().addProvider(provider):  # refused, and deleted, where it is there already
+            self._provider = provider
 
     def initGui(self) -> None:
         """Add the provider when the desktop starts."""

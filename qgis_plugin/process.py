@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -66,6 +69,7 @@ def clean_environment(**more: str) -> QProcessEnvironment:
         if name.upper().startswith(_FOREIGN):
             environment.remove(name)
     environment.insert("PYTHONUTF8", "1")  # what it prints is read as UTF-8, whatever the system's code page
+    environment.insert("PYTHONSAFEPATH", "1")  # nothing is imported from the folder that it is started in
     for name, value in more.items():
         environment.insert(name, value)
     return environment
@@ -78,6 +82,8 @@ def run_program(
     environment: QProcessEnvironment,
     feedback: QgsFeedback,
     on_line: Callable[[str], None],
+    folder: str = "",
+    group: bool = False,
 ) -> Ended:
     """Run a program to its end, or until the user cancels.
 
@@ -96,15 +102,20 @@ def run_program(
         Asked ten times a second whether the user has cancelled.
     on_line : callable
         Called in this thread with each line of standard output and standard error.
+    folder : str, optional
+        The folder to run it in, QGIS's own by default.
+    group : bool, default False
+        Whether the program is a group of its own (see `own_group.py`), to be killed with all that it started.
     """
     process = QProcess()
+    process.setWorkingDirectory(folder)
     process.setProcessEnvironment(environment)
     process.setProcessChannelMode(QProcess.ProcessChannelMode.MergedChannels)
     # The loop wakes up for these and does nothing else, so that no Python code runs inside a signal, where an
     # exception would end QGIS.
     loop, glance, patience = QEventLoop(), QTimer(), QTimer()
-    for signal in (process.readyRead, process.finished, process.errorOccurred, glance.timeout, patience.timeout):
-        signal.connect(loop.quit)
+    for event in (process.readyRead, process.finished, process.errorOccurred, glance.timeout, patience.timeout):
+        event.connect(loop.quit)
     glance.start(_GLANCE_MS)
     patience.setSingleShot(True)
     process.start(program, list(arguments))
@@ -117,12 +128,20 @@ def run_program(
             process.closeWriteChannel()
             patience.start(_PATIENCE_MS)
         elif cancelled and not patience.isActive():
-            process.kill()
+            _kill(process, group=group)
     _pass_lines(rest + process.readAll().data() + b"\n", on_line)
     if process.error() == QProcess.ProcessError.FailedToStart:
         return Ended(None, cancelled, process.errorString())
     crashed = process.exitStatus() != QProcess.ExitStatus.NormalExit
     return Ended(None if crashed else process.exitCode(), cancelled)
+
+
+def _kill(process: QProcess, *, group: bool) -> None:
+    leader = process.processId()
+    if group and os.name == "posix" and leader > 0:  # it is 0 when it has ended by itself, and would mean our own group
+        with contextlib.suppress(ProcessLookupError):  # it is not yet, or no longer, a group of its own
+            os.killpg(leader, signal.SIGKILL)
+    process.kill()
 
 
 def _pass_lines(text: bytes, on_line: Callable[[str], None]) -> bytes:

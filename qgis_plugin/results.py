@@ -23,13 +23,17 @@ from qgis.core import (
     QgsWkbTypes,
 )
 
+from .compat import INTEGER
 from .parameters import explained
+from .staging import crs_of
 from .translation import tr
 
 _CHUNK = 2000
 
 #: A Shapefile cuts names of columns at ten characters; these are the names that the command line writes to it.
 _SHAPEFILE_NAMES = {"element_id": "elem_id", "n_observations": "n_obs", "n_instances": "n_inst"}
+
+_WHOLE_NUMBER_DIGITS = 18
 
 _SOURCE_TYPES = {
     "line": QgsProcessing.SourceType.TypeVectorLine,
@@ -41,6 +45,10 @@ _WKB_TYPES = {
     "polygon": QgsWkbTypes.Type.Polygon,
     "table": QgsWkbTypes.Type.NoGeometry,
 }
+
+
+#: QGIS takes an empty layer that may hold any kind of geometry for a table.
+_SAYS_NOTHING = (QgsWkbTypes.Type.Unknown, QgsWkbTypes.Type.NoGeometry)
 
 
 class Result(NamedTuple):
@@ -112,9 +120,9 @@ def deliver(
     layer = _open(file, result.layer if is_there else result.like)
     kept = [n for n, field in enumerate(layer.fields()) if n not in layer.primaryKeyAttributes()]
     fields = _named_fields([layer.fields()[n] for n in kept], destination_text(parameters.get(result.parameter)))
-    known = is_there and layer.wkbType() != QgsWkbTypes.Type.Unknown
+    known = is_there and layer.wkbType() not in _SAYS_NOTHING
     kind = layer.wkbType() if known else _WKB_TYPES[result.kind]
-    sink, destination = algorithm.parameterAsSink(parameters, result.parameter, context, fields, kind, layer.crs())
+    sink, destination = algorithm.parameterAsSink(parameters, result.parameter, context, fields, kind, crs_of(layer))
     if sink is None:
         if result.optional and not destination_text(parameters.get(result.parameter)):
             return {}
@@ -148,7 +156,9 @@ def _named_fields(wanted: list[QgsField], destination: str) -> QgsFields:
     fields, shapefile = QgsFields(), destination.lower().endswith(".shp")
     for field in wanted:
         short = _SHAPEFILE_NAMES.get(field.name(), field.name()) if shapefile else field.name()
-        fields.append(QgsField(short, field.type()))
+        # Without a length a Shapefile makes real numbers of whole ones.
+        digits = _WHOLE_NUMBER_DIGITS if shapefile and field.type() == INTEGER else 0
+        fields.append(QgsField(short, field.type(), "", digits))
     return fields
 
 

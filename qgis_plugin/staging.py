@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,14 +25,15 @@ from qgis.core import (
     QgsField,
     QgsFields,
     QgsProcessingException,
+    QgsProviderRegistry,
     QgsVectorFileWriter,
     QgsVectorLayer,
     QgsVectorLayerFeatureSource,
     QgsWkbTypes,
 )
-from qgis.PyQt.QtCore import Qt, QTime
+from qgis.PyQt.QtCore import QCoreApplication, QDateTime, Qt, QTime
 
-from .compat import INTEGER, PLAIN_TYPES, TEXT
+from .compat import DATE_AND_TIME, INTEGER, PLAIN_TYPES, TEXT
 from .progress import Part
 from .translation import tr
 
@@ -41,11 +42,15 @@ _CHUNK = 2000
 
 #: Characters that file systems or the worker would take for something else than a part of a name.
 _NOT_IN_NAMES = re.compile(r'[\x00-\x1f/\\:*?"<>|!;]')
-_LONGEST_NAME = 80
+
+#: In bytes; file systems allow 255, of which SQLite's journals need some.
+_LONGEST_NAME = 160
 
 # The worker knows a feature by the id it has here, so that it becomes the id in the GeoPackage; neither column may
 # bear a name that one of the user's could have.
 _ID_COLUMN, _GEOMETRY_COLUMN = "polymerge_feature_id", "polymerge_geometry"
+
+_LONGEST_REASON = 200
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,27 @@ class Input:
     count: int
     #: The column that holds nothing but the feature ids of its file; empty where there is none.
     id_column: str = ""
+
+
+def layer_inputs(layers: Sequence[QgsVectorLayer], *, selected_only: bool = False) -> list[Input]:
+    """Take layers as they are now; call this in their thread.
+
+    Layers of one file that bear the file's name, as ``qgis_process`` opens them, get their own names.
+    """
+    files = [file_of(layer) for layer in layers]
+    taken = []
+    for layer, file in zip(layers, files):
+        given = layer_input(layer, selected_only=selected_only)
+        if files.count(file) > 1 and layer.name() == Path(file).stem:
+            parts = QgsProviderRegistry.instance().decodeUri(layer.providerType(), layer.source())
+            given = replace(given, title=parts.get("layerName") or layer.name())
+        taken.append(given)
+    return taken
+
+
+def file_of(layer: QgsVectorLayer) -> str:
+    """Return the file that a layer lies in; empty for a layer that lies in none."""
+    return str(QgsProviderRegistry.instance().decodeUri(layer.providerType(), layer.source()).get("path", ""))
 
 
 def layer_input(layer: QgsVectorLayer, *, selected_only: bool = False) -> Input:
@@ -98,7 +124,7 @@ def file_names(titles: Sequence[str]) -> list[str]:
     """
     names: list[str] = []
     for title in titles:
-        plain = _NOT_IN_NAMES.sub("_", title).strip(" .")[:_LONGEST_NAME] or "layer"
+        plain = _NOT_IN_NAMES.sub("_", title).strip(" .").encode()[:_LONGEST_NAME].decode(errors="ignore") or "layer"
         name, number = plain, 1
         while name.casefold() in {other.casefold() for other in names}:
             number += 1
@@ -129,18 +155,18 @@ def stage_layer(given: Input, file: Path, layer: str, part: Part, *, spatial: bo
         If it cannot be written, or the user cancels.
     """
     kept = [n for n, field in enumerate(given.fields) if field.name() != given.id_column]
-    as_text = [given.fields[n].type() not in PLAIN_TYPES for n in kept]
+    precise = _with_fractions(given, kept)
+    as_text = [n in precise or given.fields[n].type() not in PLAIN_TYPES for n in kept]
     fields = _fields([given.fields[n] for n in kept], as_text)
     file.parent.mkdir(exist_ok=True)
     writer = _writer(given, fields, file, layer, spatial=spatial)
     done = 0
     for chunk in _chunks(given.read(QgsFeatureRequest())):
+        QCoreApplication.processEvents()  # qgis_process hears Ctrl-C in its event loop only
         if part.feedback.isCanceled():
             raise QgsProcessingException(tr("Cancelled; nothing was written."))
         if not writer.addFeatures([_row(feature, fields, kept, as_text) for feature in chunk], _FAST):
-            raise QgsProcessingException(
-                tr("Layer “{}” cannot be handed to the worker: {}").format(given.title, writer.errorMessage())
-            )
+            raise _cannot_be_written(given, writer)
         done += len(chunk)
         part.reached(done / max(given.count, done))
     del writer  # closes the file
@@ -149,11 +175,23 @@ def stage_layer(given: Input, file: Path, layer: str, part: Part, *, spatial: bo
 _FAST = QgsFeatureSink.Flag.FastInsert
 
 
+def _with_fractions(given: Input, columns: Sequence[int]) -> set[int]:
+    """Return the columns of times with fractions of a second, which QGIS would cut off; frames are ordered by them."""
+    times = [n for n in columns if given.fields[n].type() == DATE_AND_TIME]
+    found: set[int] = set()
+    if times:
+        bare = QgsFeatureRequest().setSubsetOfAttributes(times).setFlags(QgsFeatureRequest.Flag.NoGeometry)
+        for feature in given.read(bare):
+            values = feature.attributes()
+            found |= {n for n in times if isinstance(values[n], QDateTime) and values[n].time().msec()}
+    return found
+
+
 def _fields(wanted: Sequence[QgsField], as_text: Sequence[bool]) -> QgsFields:
     """Return the columns of the GeoPackage: names that differ in more than case, no limits of length."""
     fields = QgsFields()
     fields.append(QgsField(_ID_COLUMN, INTEGER))
-    used = set()
+    used = {_ID_COLUMN, _GEOMETRY_COLUMN}
     for field, text in zip(wanted, as_text):
         name, number = field.name(), 0
         while name.casefold() in used:
@@ -170,16 +208,19 @@ def _writer(given: Input, fields: QgsFields, file: Path, layer: str, *, spatial:
     options.layerOptions = [f"FID={_ID_COLUMN}", f"GEOMETRY_NAME={_GEOMETRY_COLUMN}"]
     if file.exists():
         options.actionOnExistingFile = QgsVectorFileWriter.ActionOnExistingFile.CreateOrOverwriteLayer
-    # Layers say less of their features than is true: a layer of lines may hold curves, parts and heights, and an
+    # Layers say less of their features than is true: a layer of lines may hold curves and parts, and an
     # empty one may not know what it would hold.
     kind = QgsWkbTypes.Type.Unknown if spatial else QgsWkbTypes.Type.NoGeometry
     context = QgsCoordinateTransformContext()
     writer = QgsVectorFileWriter.create(str(file), fields, kind, given.crs, context, options)
     if writer.hasError() != QgsVectorFileWriter.WriterError.NoError:
-        raise QgsProcessingException(
-            tr("Layer “{}” cannot be handed to the worker: {}").format(given.title, writer.errorMessage())
-        )
+        raise _cannot_be_written(given, writer)
     return writer
+
+
+def _cannot_be_written(given: Input, writer: QgsVectorFileWriter) -> QgsProcessingException:
+    why = next(iter(writer.errorMessage().splitlines()), "")[:_LONGEST_REASON]  # a database adds its whole SQL
+    return QgsProcessingException(tr("Layer “{}” cannot be handed to the worker: {}").format(given.title, why))
 
 
 def _chunks(features: QgsFeatureIterator) -> Iterator[list[QgsFeature]]:
@@ -202,4 +243,7 @@ def _text(value: Any) -> Any:
         return NULL
     if isinstance(value, (list, dict)):
         return json.dumps(value, ensure_ascii=False, default=str)
-    return value.toString(Qt.DateFormat.ISODate) if isinstance(value, QTime) else str(value)
+    if isinstance(value, (QDateTime, QTime)):
+        clock = value if isinstance(value, QTime) else value.time()
+        return value.toString(Qt.DateFormat.ISODateWithMs if clock.msec() else Qt.DateFormat.ISODate)
+    return str(value)

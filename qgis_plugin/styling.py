@@ -56,7 +56,8 @@ def name_classes(layer: QgsVectorLayer) -> None:
     if not isinstance(renderer, QgsCategorizedSymbolRenderer):
         return
     column = layer.fields().lookupField(renderer.classAttribute())
-    present = {str(value) for value in layer.uniqueValues(column, _MOST_CLASSES + 1)} if column >= 0 else set()
+    values = layer.uniqueValues(column, _MOST_CLASSES + 1) if column >= 0 else ()
+    present = {"" if value in (None, NULL) else str(value) for value in values}
     categories = renderer.categories()
     others = next((each for each in categories if each.value() in (None, NULL, "")), None)
     if others is None or len(present) > _MOST_CLASSES:

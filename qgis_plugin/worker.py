@@ -62,6 +62,7 @@ def run_worker(command: str, arguments: Sequence[str], part: Part, *, shown_as: 
         environment=clean_environment(PYTHONPATH=str(ROOT)),
         feedback=part.feedback,
         on_line=listener.hear,
+        folder=str(ROOT),  # an older Python looks for modules in the folder that it is started in
     )
     if part.feedback.isCanceled():  # Ctrl-C in a terminal may have reached the worker first
         raise QgsProcessingException(tr("Cancelled; nothing was written."))
@@ -80,8 +81,7 @@ class _Listener:
 
     def hear(self, line: str) -> None:
         """Take one line of the worker."""
-        if line.startswith('{"fraction"'):
-            self._progress(line)
+        if self._is_progress(line):
             return
         for path, title in self._shown_as.items():
             line = line.replace(path, title)
@@ -96,12 +96,18 @@ class _Listener:
             self.others.append(line)
             self._feedback.pushInfo(line)
 
-    def _progress(self, line: str) -> None:
-        news = json.loads(line)
+    def _is_progress(self, line: str) -> bool:
+        if not line.startswith('{"fraction"'):
+            return False
+        try:
+            news = json.loads(line)
+        except ValueError:  # cut off by a crash
+            return False
         self._part.reached(news["fraction"])
         if news["message"] != self._message:
             self._message = news["message"]
             self._feedback.setProgressText(self._message)
+        return True
 
 
 def _unforeseen(ended: Ended, python: str, said: Sequence[str]) -> str:

@@ -40,6 +40,8 @@ class LayerInfo(NamedTuple):
         How many features it says it has; -1 where it does not say.
     encoding : str
         Of its text.
+    id_column : str
+        The column that feature ids come from, where they come from one; only GeoJSON has it among its fields too.
     """
 
     name: str
@@ -47,6 +49,7 @@ class LayerInfo(NamedTuple):
     fields: tuple[str, ...] = ()
     features: int = -1
     encoding: str = "UTF-8"
+    id_column: str = ""
 
     @property
     def is_points(self) -> bool:
@@ -70,6 +73,7 @@ def known_layers(source: Source) -> list[LayerInfo]:
                 tuple(info["fields"]),
                 info["features"],
                 info["encoding"] or "UTF-8",
+                info["fid_column"] or "",
             )
             for info in infos
         ]
@@ -121,9 +125,18 @@ def _read_arrow(source: Source, layer: LayerInfo, **options: Any) -> Any:
     if source.kind == "ESRI Shapefile" and layer.encoding != "UTF-8":
         options["ENCODING"] = layer.encoding  # Arrow takes UTF-8 only, so GDAL has to convert
     exact = {"types_mapper": EXACT_TYPES.get}
-    return pyogrio.read_dataframe(
+    twice = layer.id_column if layer.id_column in layer.fields else ""
+    if twice:  # Arrow would deliver it as a column and as the index, under one name
+        options["columns"] = [name for name in layer.fields if name != twice]
+    frame = pyogrio.read_dataframe(
         source.gdal_path, layer=layer.name, use_arrow=True, fid_as_index=True, arrow_to_pandas_kwargs=exact, **options
     )
+    if twice:
+        column = pyogrio.read_dataframe(
+            source.gdal_path, layer=layer.name, columns=[twice], read_geometry=False, fid_as_index=True
+        )
+        frame.insert(layer.fields.index(twice), twice, column[twice])
+    return frame
 
 
 def _read_parquet(source: Source) -> gpd.GeoDataFrame:

@@ -144,11 +144,17 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
                 return tr("{} would overwrite {}, {}: choose another file.").format(
                     title, taken[file.resolve()], file.name
                 )
+            if name == "REPORT" and not file.absolute().parent.is_dir():
+                return tr("{} {} cannot be written: there is no such folder.").format(title, file)
             taken[file.resolve()] = tr("the output {}").format(title)
         return ""
 
     def checkParameterValues(self, parameters: Parameters, context: QgsProcessingContext) -> tuple[bool, str]:
         """Say what is wrong with the parameters before anything runs."""
+        for each in self.parameterDefinitions():
+            value = parameters.get(each.name(), each.defaultValue())
+            if not each.checkValueIsAcceptable(value, context):  # QGIS would only say that it is incorrect
+                return False, _unacceptable(each, value)
         fine, message = super().checkParameterValues(parameters, context)
         if fine:
             message = self.fault(parameters, context)
@@ -216,7 +222,20 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
                 done.update(deliver(result, output, self, parameters, context))
             copy_to = self.parameterAsFileOutput(parameters, "REPORT", context)
             if copy_to:
-                shutil.copyfile(report, copy_to)
+                try:
+                    shutil.copyfile(report, copy_to)
+                except OSError as error:
+                    message = tr("The report {} cannot be written: {}").format(copy_to, error.strerror)
+                    raise QgsProcessingException(message) from error
                 done["REPORT"] = copy_to
         feedback.setProgress(100)
         return done
+
+
+def _unacceptable(definition: QgsProcessingParameterDefinition, value: Any) -> str:
+    shown = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value or "")
+    if shown and definition.type() in {"multilayer", "vector"}:
+        message = tr("{} ({}): {} cannot be opened as a layer; look whether it is there.")
+        return message.format(definition.description(), definition.name(), shown)
+    message = tr("{} ({}) cannot be {}. {}")
+    return message.format(definition.description(), definition.name(), shown or tr("empty"), definition.help())

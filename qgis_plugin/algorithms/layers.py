@@ -7,13 +7,14 @@ from pathlib import Path
 from qgis.core import (
     QgsProcessingContext,
     QgsProcessingFeedback,
+    QgsProviderRegistry,
     QgsVectorLayer,
     QgsWkbTypes,
 )
 
 from ..parameters import is_known
 from ..progress import Part
-from ..staging import Input, crs_of, file_names, layer_input, stage_layer
+from ..staging import Input, crs_of, file_names, file_of, layer_input, layer_inputs, stage_layer
 from ..translation import tr
 from .base import Parameters, Staged, WorkerAlgorithm
 
@@ -36,6 +37,9 @@ READING_OPTIONS = (
 
 #: The parts of a main map by the names that they have in the worker's file.
 _ALIASES = "id_aliases"
+
+#: The layers that are meant where a file of PolyMerge is named without one; the command line takes them too.
+_CONTRACT = frozenset({"local_maps", "elements"})
 _MAIN_MAP = {"MAIN_MAP": "elements", "MAIN_MAP_AREAS": "elements_areas", "MAIN_MAP_ALIASES": _ALIASES}
 
 
@@ -54,7 +58,9 @@ class LayerAlgorithm(WorkerAlgorithm):
         super().prepareAlgorithm(parameters, context, feedback)
         selected = self.parameterAsBoolean(parameters, "SELECTED_ONLY", context)
         layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
-        self._layers = [layer_input(layer, selected_only=selected) for layer in layers]
+        for warning in filter(None, map(_passed_over, layers)):
+            feedback.pushWarning(warning)
+        self._layers = layer_inputs(layers, selected_only=selected)
         for name, part in _MAIN_MAP.items():
             layer = self.parameterAsVectorLayer(parameters, name, context)
             if layer is not None:
@@ -83,31 +89,65 @@ class LayerAlgorithm(WorkerAlgorithm):
         """Return the files of the layers that lie in files."""
         layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
         layers += [self.parameterAsVectorLayer(parameters, name, context) for name in _MAIN_MAP]
-        return [layer.source().split("|")[0] for layer in layers if layer is not None]
+        files = [file_of(layer) for layer in layers if layer is not None]
+        return [file for file in files if file]
 
     def fault(self, parameters: Parameters, context: QgsProcessingContext) -> str:
         """Return what is wrong with the layers, as far as QGIS can know."""
-        fault = super().fault(parameters, context)
-        if fault:
-            return fault
-        layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
+        return (
+            super().fault(parameters, context)
+            or self._unopened(parameters, context)
+            or self._contradiction(parameters, context)
+            or self._unfit(parameters, context)
+        )
+
+    def _unopened(self, parameters: Parameters, context: QgsProcessingContext) -> str:
+        """Name a layer that Processing would pass over in silence."""
         given = parameters.get("LOCAL_MAPS")
-        if isinstance(given, (list, tuple)) and len(layers) < len(given):
+        opened = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
+        if isinstance(given, (list, tuple)) and len(opened) < len(given):
             return tr("One of the layers to merge cannot be opened: choose the layers again.")
-        main_map = self.parameterAsVectorLayer(parameters, "MAIN_MAP", context)
-        if main_map is None and any(parameters.get(name) for name in ("MAIN_MAP_AREAS", "MAIN_MAP_ALIASES")):
+        for name in _MAIN_MAP:
+            if parameters.get(name) and self.parameterAsVectorLayer(parameters, name, context) is None:
+                title = self.parameterDefinition(name).description()
+                return tr("The layer that is given as {} ({}) cannot be opened: choose it again.").format(title, name)
+        return ""
+
+    def _contradiction(self, parameters: Parameters, context: QgsProcessingContext) -> str:
+        if not parameters.get("MAIN_MAP") and any(parameters.get(name) for name in _MAIN_MAP):
             return tr("Areas or retired ids of a main map are given, but no main map: choose it too.")
         declared = self.parameterAsCrs(parameters, "CRS", context).isValid()
-        plain = self.parameterAsBoolean(parameters, "LOCAL_CRS", context)
-        if declared and plain:
+        if declared and self.parameterAsBoolean(parameters, "LOCAL_CRS", context):
             return tr(
                 "Layers without a CRS cannot be both in a CRS and in plain metres: give CRS or LOCAL_CRS, not both."
             )
-        for layer in [*layers, *([] if main_map is None else [main_map])]:
-            fault = _layer_fault(layer, has_crs=is_known(crs_of(layer)) or declared or plain)
-            if fault:
-                return fault
         return ""
+
+    def _unfit(self, parameters: Parameters, context: QgsProcessingContext) -> str:
+        layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
+        main_map = self.parameterAsVectorLayer(parameters, "MAIN_MAP", context)
+        declared = self.parameterAsCrs(parameters, "CRS", context).isValid()
+        plain = self.parameterAsBoolean(parameters, "LOCAL_CRS", context)
+        faults = (
+            _layer_fault(layer, has_crs=is_known(crs_of(layer)) or declared or plain)
+            for layer in [*layers, *([] if main_map is None else [main_map])]
+        )
+        return next(filter(None, faults), "")
+
+
+def _passed_over(layer: QgsVectorLayer) -> str:
+    """Say which layer of a file is taken where none was named, as QGIS does without a word; empty where it is plain."""
+    if layer.providerType() != "ogr" or "|" in layer.source():
+        return ""
+    metadata = QgsProviderRegistry.instance().providerMetadata("ogr")
+    spatial = [
+        each.name() for each in metadata.querySublayers(layer.source()) if each.wkbType() != QgsWkbTypes.Type.NoGeometry
+    ]
+    if len(spatial) < 2 or spatial[0] in _CONTRACT:
+        return ""
+    return tr(
+        "{} holds several layers, of which the first is taken, {}: name the others as {}|layername=LAYER."
+    ).format(Path(layer.source()).name, spatial[0], Path(layer.source()).name)
 
 
 def _layer_fault(layer: QgsVectorLayer, *, has_crs: bool) -> str:

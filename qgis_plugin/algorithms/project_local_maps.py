@@ -7,7 +7,7 @@ from typing import Any
 
 from qgis.core import QgsProcessingContext, QgsProcessingParameterCrs, QgsProcessingParameterDefinition
 
-from ..parameters import choice_parameter, explained, file_parameter, switch_parameter, text_parameter
+from ..parameters import absolute_file, choice_parameter, explained, file_parameter, switch_parameter, text_parameter
 from ..progress import Part
 from ..results import Result
 from ..translation import mark, tr
@@ -96,7 +96,7 @@ class ProjectLocalMaps(WorkerAlgorithm):
     def stage(self, parameters: Parameters, context: QgsProcessingContext, folder: Path, part: Part) -> Staged:
         """Name the files, which the worker reads itself."""
         del folder, part
-        predictions, poses = (self.parameterAsFile(parameters, name, context) for name in ("PREDICTIONS", "POSES"))
+        predictions, poses = (absolute_file(self, parameters, name, context) for name in ("PREDICTIONS", "POSES"))
         drive = self.parameterAsString(parameters, "DRIVE", context)
         named = [] if drive else [f"--drive={Path(predictions).stem}"]
         return Staged([f"--poses={poses}", *named], [predictions], {})

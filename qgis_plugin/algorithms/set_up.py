@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,13 @@ from ..environment import (
     worker_python,
 )
 from ..layout import REQUIREMENTS, ROOT
-from ..parameters import file_parameter, folder_parameter, switch_parameter
+from ..parameters import absolute_file, file_parameter, folder_parameter, switch_parameter
 from ..process import clean_environment, run_program
 from ..translation import mark, tr
 from .base import Parameters, PolyMergeAlgorithm
 
 _CHECK = str(ROOT / "qgis_plugin" / "check_python.py")
+_OWN_GROUP = str(ROOT / "qgis_plugin" / "own_group.py")
 
 
 class SetUp(PolyMergeAlgorithm):
@@ -86,8 +88,7 @@ class SetUp(PolyMergeAlgorithm):
         self, parameters: Parameters, context: QgsProcessingContext, feedback: QgsProcessingFeedback
     ) -> dict[str, Any]:
         """Check, use or make an environment."""
-        python = self.parameterAsFile(parameters, "PYTHON", context)
-        wheels = self.parameterAsFile(parameters, "WHEELS", context)
+        python, wheels = (absolute_file(self, parameters, name, context) for name in ("PYTHON", "WHEELS"))
         if self.parameterAsBoolean(parameters, "CHECK_ONLY", context):
             python = _present()
             _check(python, feedback)
@@ -157,8 +158,16 @@ def _run(python: str, arguments: list[str], feedback: QgsProcessingFeedback, fai
 
     if not Path(python).is_file():
         raise QgsProcessingException(failure.format(python, tr("there is no such file")))
-    environment = clean_environment(PYTHONPATH=str(ROOT))
-    ended = run_program(python, arguments, environment=environment, feedback=feedback, on_line=hear)
+    ended = run_program(
+        python,
+        # venv runs pip in further processes, which a cancel must end too; Windows knows no groups.
+        [*([] if os.name == "nt" else ["-I", _OWN_GROUP, python]), *arguments],
+        environment=clean_environment(PYTHONPATH=str(ROOT)),
+        feedback=feedback,
+        on_line=hear,
+        folder=str(ROOT),
+        group=True,
+    )
     if ended.cancelled:
         raise QgsProcessingException(tr("Cancelled; the environment is as it was before."))
     if not ended.well:

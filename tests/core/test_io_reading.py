@@ -1,5 +1,6 @@
 """Files of others are read by what they hold, local maps by the layer contract."""
 
+import json
 import shutil
 import sqlite3
 import struct
@@ -348,3 +349,20 @@ def test_source_files_are_all_that_is_read(tmp_path):
     assert names("m.shp|layername=m") == ["m.shp"]
     assert names("m.gpkg") == ["m.gpkg"]
     assert names("predictions.json") == ["predictions.json"]
+
+
+def test_a_geojson_keeps_its_column_id_and_takes_feature_ids_from_it(tmp_path):
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"name": name, "id": number},
+            "geometry": {"type": "LineString", "coordinates": line},
+        }
+        for name, number, line in (("a", 5, [[7, 50], [8, 50]]), ("b", 9, [[7, 51], [8, 51]]))
+    ]
+    file = tmp_path / "roads.geojson"
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    (roads,) = read_layers(file).values()
+    assert roads.index.tolist() == [5, 9]
+    assert list(roads.columns) == ["name", "id", "geometry"]
+    assert roads["id"].tolist() == [5, 9]
