@@ -1,14 +1,20 @@
-"""Become another program in a process group of its own: ``own_group.py PROGRAM [ARGUMENT ...]``.
+"""Run a module or script as Python would, in a process group of its own: ``own_group.py [-m] NAME [ARGUMENT ...]``.
 
-All that the program starts is in the group too, so that it can be ended together with it. The program keeps the id of
-this process, which is then also the group's.
+Programs that it starts are in the group too, so that all can be ended together.
 """
 
 from __future__ import annotations
 
 import os
+import runpy
 import sys
 
 if __name__ == "__main__":
-    os.setpgid(0, 0)
-    os.execv(sys.argv[1], sys.argv[1:])  # noqa: S606 - no shell is what is wanted
+    if hasattr(os, "setpgid"):  # Windows has no groups
+        os.setpgid(0, 0)
+    if sys.argv[1] == "-m":
+        sys.argv = sys.argv[2:]
+        runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+    else:
+        sys.argv = sys.argv[1:]
+        runpy.run_path(sys.argv[0], run_name="__main__")

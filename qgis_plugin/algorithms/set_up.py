@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -117,9 +116,11 @@ def _make(python: str, wheels: str, feedback: QgsProcessingFeedback) -> str:
     source = ["--no-index", f"--find-links={wheels}"] if wheels else []
     with new_environment() as folder:
         _step(feedback, 0, tr("Looking at {}").format(python))
-        _run(python, ["-I", _CHECK], feedback, tr("{} cannot make an environment ({}): choose another Python."))
+        unfit = tr("{} cannot make an environment ({}): choose another Python.")
+        _run(python, [_CHECK], feedback, unfit, isolated=True)
         _step(feedback, 5, tr("Making an environment in {}").format(folder))
-        _run(python, ["-I", "-m", "venv", str(folder)], feedback, tr("{} cannot make an environment ({})."))
+        failed = tr("{} cannot make an environment ({}).")
+        _run(python, ["-m", "venv", str(folder)], feedback, failed, isolated=True)
         made = interpreter_of(folder)
         _step(feedback, 15, tr("Installing the libraries from {}").format(wheels or "PyPI"))
         quiet = ["--disable-pip-version-check", "--no-input", "--progress-bar=off"]
@@ -148,8 +149,13 @@ def _step(feedback: QgsProcessingFeedback, percent: int, text: str) -> None:
     feedback.setProgressText(text)
 
 
-def _run(python: str, arguments: list[str], feedback: QgsProcessingFeedback, failure: str) -> None:
-    """Run a Python and show what it says; `failure` has places for it and for the reason."""
+def _run(
+    python: str, arguments: list[str], feedback: QgsProcessingFeedback, failure: str, *, isolated: bool = False
+) -> None:
+    """Run a Python, perhaps without what its user added to it, and show what it says.
+
+    The sentence `failure` has places for the Python and for the reason.
+    """
     said: list[str] = []
 
     def hear(line: str) -> None:
@@ -160,8 +166,11 @@ def _run(python: str, arguments: list[str], feedback: QgsProcessingFeedback, fai
         raise QgsProcessingException(failure.format(python, tr("there is no such file")))
     ended = run_program(
         python,
-        # venv runs pip in further processes, which a cancel must end too; Windows knows no groups.
-        [*([] if os.name == "nt" else ["-I", _OWN_GROUP, python]), *arguments],
+        [
+            *(["-I"] if isolated else []),
+            _OWN_GROUP,
+            *arguments,
+        ],  # venv runs pip in further processes, which a cancel must end too
         environment=clean_environment(PYTHONPATH=str(ROOT)),
         feedback=feedback,
         on_line=hear,
