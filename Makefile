@@ -61,7 +61,7 @@ clean:
 
 APT_GET := $(if $(filter 0,$(shell id -u)),,sudo) env DEBIAN_FRONTEND=noninteractive apt-get
 
-# $(call venv,PYTHON,FOLDER): make a virtual environment. Debian ships venv apart from Python.
+# $(call venv,PYTHON,FOLDER,FLAGS): make a virtual environment. Debian ships venv apart from Python.
 define venv
 @$(1) -c "import ensurepip" 2>/dev/null || { \
   echo "python3-venv is missing: installing it"; \

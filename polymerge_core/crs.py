@@ -129,6 +129,11 @@ def working_crs(crs: pyproj.CRS, bounds: Bounds, *, centre_on: pyproj.CRS | None
     )
 
 
+def scale_error_over(crs: pyproj.CRS, bounds: Bounds, bounds_crs: pyproj.CRS) -> float:
+    """Return the largest departure of a projection's scale from 1 over bounds that are given in another CRS."""
+    return scale_error(crs, *_sample_lonlat(bounds_crs, bounds))
+
+
 def scale_error(crs: pyproj.CRS, lon: NDArray[np.float64], lat: NDArray[np.float64]) -> float:
     """Return the largest departure of a projection's scale from 1 at points given in degrees.
 

@@ -18,7 +18,15 @@ import shapely
 from numpy.typing import NDArray
 
 from polymerge_core.columns import Layer, read_columns
-from polymerge_core.crs import check_coordinates, is_local, parse_crs, transform_coordinates, working_crs
+from polymerge_core.crs import (
+    SCALE_TOLERANCE,
+    check_coordinates,
+    is_local,
+    parse_crs,
+    scale_error_over,
+    transform_coordinates,
+    working_crs,
+)
 from polymerge_core.errors import CrsError, InputError
 from polymerge_core.options import Options
 from polymerge_core.ordering import canonical_order
@@ -115,7 +123,7 @@ def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], opti
     features, attributes, notes = read_columns(layers, options)
     parts = _explode(features)
     parts = _resolve_kinds(parts, options)
-    layer_crs, reference, work = _choose_crs(layers, parts, options)
+    layer_crs, reference, work = _choose_crs(layers, parts, options, notes["warnings"])
     if options.crs is not None and all(layer.data.crs is not None for layer in layers):
         notes["warnings"].append("crs was not used: every layer has a CRS of its own")
     out_crs = reference if options.out_crs is None else parse_crs(options.out_crs)
@@ -219,7 +227,7 @@ def _lines_to_polygons(parts: pd.DataFrame) -> None:
 
 
 def _choose_crs(
-    layers: list[Layer], parts: pd.DataFrame, options: Options
+    layers: list[Layer], parts: pd.DataFrame, options: Options, warnings: list[str]
 ) -> tuple[list[pyproj.CRS], pyproj.CRS, pyproj.CRS]:
     """Return the CRS of every layer, the reference one (main map's, else first) and the working one."""
     declared = None if options.crs is None else parse_crs(options.crs)
@@ -252,7 +260,14 @@ def _choose_crs(
     if not np.isfinite(boxes).all():
         raise CrsError(f"the layers lie so far apart that they cannot be brought together in {reference.name}")
     union = (*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist())
-    return layer_crs, reference, working_crs(reference, union)
+    work = working_crs(reference, union)
+    error = scale_error_over(work, union, reference)
+    if error > SCALE_TOLERANCE:
+        warnings.append(
+            f"the layers lie so far apart that lengths and the proximity are up to {error:.1%} off; merge places that "
+            "are far from each other one by one"
+        )
+    return layer_crs, reference, work
 
 
 def _layer_crs(layer: Layer, declared: pyproj.CRS | None, *, needed: bool) -> pyproj.CRS | None:

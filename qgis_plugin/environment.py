@@ -55,6 +55,12 @@ def worker_python() -> str:
         raise EnvironmentMissing(
             tr("PolyMerge has no Python environment yet: run “Set up PolyMerge” in the Processing toolbox.")
         )
+    if not is_program(str(made.get("made_with", python))):  # its environment cannot start without it
+        raise EnvironmentMissing(
+            tr(
+                "{} is gone, which the Python environment of PolyMerge was made with: run “Set up PolyMerge” again."
+            ).format(made["made_with"])
+        )
     if made.get("requirements") != requirements():
         raise EnvironmentMissing(
             tr("The Python environment of PolyMerge was made for another version of it: run “Set up PolyMerge” again.")
@@ -68,10 +74,15 @@ def use_interpreter(python: str) -> None:
 
 
 @contextmanager
-def new_environment() -> Iterator[Path]:
+def new_environment(made_with: str) -> Iterator[Path]:
     """Give a folder for a new environment, which replaces the old one when nothing went wrong.
 
     Until then the old one stays, and is used.
+
+    Parameters
+    ----------
+    made_with : str
+        The interpreter that it is made with, and cannot do without.
     """
     home = environments()
     home.mkdir(parents=True, exist_ok=True)
@@ -79,7 +90,8 @@ def new_environment() -> Iterator[Path]:
     try:
         yield folder
         note = home / "made.json.new"
-        note.write_text(json.dumps({"folder": folder.name, "requirements": requirements()}), encoding="utf-8")
+        made = {"folder": folder.name, "requirements": requirements(), "made_with": made_with}
+        note.write_text(json.dumps(made), encoding="utf-8")
         note.replace(home / "made.json")
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

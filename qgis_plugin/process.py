@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
+import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from qgis.core import QgsFeedback
-from qgis.PyQt.QtCore import QEventLoop, QProcess, QProcessEnvironment, QTimer
+from qgis.PyQt.QtCore import QCoreApplication, QProcess, QProcessEnvironment
 
 #: How often a cancel is looked for.
 _GLANCE_MS = 100
 
 #: How long a program that was asked to end may take before it is killed.
-_PATIENCE_MS = 700
+_PATIENCE_S = 0.7
 
 #: What would lead another Python to the libraries of the one inside QGIS, or to the user's own.
 _FOREIGN = (
@@ -111,24 +113,19 @@ def run_program(
     process.setWorkingDirectory(folder)
     process.setProcessEnvironment(environment)
     process.setProcessChannelMode(QProcess.ProcessChannelMode.MergedChannels)
-    # The loop wakes up for these and does nothing else, so that no Python code runs inside a signal, where an
-    # exception would end QGIS.
-    loop, glance, patience = QEventLoop(), QTimer(), QTimer()
-    for event in (process.readyRead, process.finished, process.errorOccurred, glance.timeout, patience.timeout):
-        event.connect(loop.quit)
-    glance.start(_GLANCE_MS)
-    patience.setSingleShot(True)
     process.start(program, list(arguments))
-    cancelled, rest = False, b""
+    rest, give_up = b"", math.inf
     while process.state() != QProcess.ProcessState.NotRunning:
-        loop.exec()
+        # No QEventLoop: once QGIS is told to quit it returns at once, for ever, without looking at the process.
+        process.waitForReadyRead(_GLANCE_MS)
+        QCoreApplication.processEvents()
         rest = _pass_lines(rest + process.readAll().data(), on_line)
-        if feedback.isCanceled() and not cancelled:
-            cancelled = True
+        if feedback.isCanceled() and give_up == math.inf:
             process.closeWriteChannel()
-            patience.start(_PATIENCE_MS)
-        elif cancelled and not patience.isActive():
+            give_up = time.monotonic() + _PATIENCE_S
+        elif time.monotonic() > give_up:
             _kill(process, group=group)
+    cancelled = give_up != math.inf
     _pass_lines(rest + process.readAll().data() + b"\n", on_line)
     if process.error() == QProcess.ProcessError.FailedToStart:
         return Ended(None, cancelled, process.errorString())
@@ -139,7 +136,7 @@ def run_program(
 def _kill(process: QProcess, *, group: bool) -> None:
     leader = process.processId()
     if group and os.name == "posix" and leader > 0:  # it is 0 when it has ended by itself, and would mean our own group
-        with contextlib.suppress(ProcessLookupError):  # it is not yet, or no longer, a group of its own
+        with contextlib.suppress(ProcessLookupError, PermissionError):  # not yet, or no longer, a group of its own
             os.killpg(leader, signal.SIGKILL)
     process.kill()
 

@@ -22,7 +22,7 @@ class PolyMergeProvider(QgsProcessingProvider):
 
     def __init__(self) -> None:
         super().__init__()
-        self._styles: list[Style] = []
+        self._styles: set[Style] = set()
 
     def id(self) -> str:
         """Return the id of the provider; it never changes."""
@@ -65,6 +65,8 @@ class PolyMergeProvider(QgsProcessingProvider):
     def style(self, name: str) -> Style:
         """Return a layer style, as something that QGIS calls when it has loaded a layer."""
         # QGIS calls it when the algorithm is gone, and deletes it after the run; until then somebody has to keep it.
-        self._styles = [style for style in self._styles if not sip.isdeleted(style)]
-        self._styles.append(Style(name))
-        return self._styles[-1]
+        # Runs in several threads ask at the same time, so that the set is changed in place.
+        style = Style(name)
+        self._styles.difference_update([each for each in tuple(self._styles) if sip.isdeleted(each)])
+        self._styles.add(style)
+        return style

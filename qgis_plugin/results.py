@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +14,7 @@ from qgis.core import (
     QgsProcessingAlgorithm,
     QgsProcessingContext,
     QgsProcessingException,
-    QgsProcessingOutputLayerDefinition,
+    QgsProcessingFeedback,
     QgsProcessingParameterFeatureSink,
     QgsProviderRegistry,
     QgsVectorLayer,
@@ -24,11 +22,10 @@ from qgis.core import (
 )
 
 from .compat import INTEGER
+from .destinations import destination_text
 from .parameters import explained
-from .staging import crs_of
+from .staging import crs_of, in_chunks
 from .translation import tr
-
-_CHUNK = 2000
 
 #: A Shapefile cuts names of columns at ten characters; these are the names that the command line writes to it.
 _SHAPEFILE_NAMES = {"element_id": "elem_id", "n_observations": "n_obs", "n_instances": "n_inst"}
@@ -60,34 +57,35 @@ class Result(NamedTuple):
         Name of the sink.
     title : str
         What it is called in the dialog and in the layer tree.
-    layer : str
-        Name of the layer in the worker's GeoPackage.
+    layers : tuple of str
+        Names that the layer may have in the worker's GeoPackage. Where there is none of them, because nothing belongs
+        in it, it has the columns of the last one.
     kind : {"line", "polygon", "table"}
         What its features are.
     help : str
         What is in it.
     style : str
         Name of the layer style.
-    like : str
-        The layer whose columns it has where the worker did not write it, because nothing belongs in it.
     optional : bool
         Whether the user may do without it.
     wanted : bool
         Whether it is made where the user does not say.
     shown_empty : bool
         Whether it is loaded into the project when there is nothing in it.
+    precious : bool
+        Whether the user is warned where there is something in it that is not kept.
     """
 
     parameter: str
     title: str
-    layer: str
+    layers: tuple[str, ...]
     kind: str
     help: str
     style: str
-    like: str = ""
     optional: bool = True
     wanted: bool = True
     shown_empty: bool = False
+    precious: bool = False
 
     def definition(self) -> QgsProcessingParameterFeatureSink:
         """Return the sink's definition."""
@@ -103,6 +101,7 @@ def deliver(
     algorithm: QgsProcessingAlgorithm,
     parameters: dict[str, Any],
     context: QgsProcessingContext,
+    feedback: QgsProcessingFeedback,
 ) -> dict[str, str]:
     """Copy a layer of the worker into the sink that the user chose.
 
@@ -116,40 +115,43 @@ def deliver(
     QgsProcessingException
         If the sink cannot be made or written to.
     """
-    is_there = result.layer in _layer_names(file)
-    layer = _open(file, result.layer if is_there else result.like)
+    there = _layers_of(file, result)
+    layer = _open(file, there[0] if there else result.layers[-1])
     kept = [n for n, field in enumerate(layer.fields()) if n not in layer.primaryKeyAttributes()]
-    fields = _named_fields([layer.fields()[n] for n in kept], destination_text(parameters.get(result.parameter)))
-    known = is_there and layer.wkbType() not in _SAYS_NOTHING
-    kind = layer.wkbType() if known else _WKB_TYPES[result.kind]
+    wanted = destination_text(parameters.get(result.parameter), context)
+    fields = _named_fields([layer.fields()[n] for n in kept], wanted)
+    kind = layer.wkbType() if there and layer.wkbType() not in _SAYS_NOTHING else _WKB_TYPES[result.kind]
     sink, destination = algorithm.parameterAsSink(parameters, result.parameter, context, fields, kind, crs_of(layer))
+    if sink is None and result.optional and not wanted:
+        if result.precious and there and layer.featureCount():
+            message = tr("{} features of “{}” are not kept: name an output for them ({}).")
+            feedback.pushWarning(message.format(layer.featureCount(), result.title, result.parameter))
+        return {}
     if sink is None:
-        if result.optional and not destination_text(parameters.get(result.parameter)):
-            return {}
         raise QgsProcessingException(algorithm.invalidSinkError(parameters, result.parameter))
-    if is_there:
+    if there:
         _copy(layer, sink, fields, kept, result)
     del sink  # closes a file
-    _prepare_loading(result, destination, context, empty=not (is_there and layer.featureCount()), algorithm=algorithm)
+    _prepare_loading(result, destination, context, empty=not (there and layer.featureCount()), algorithm=algorithm)
     return {result.parameter: destination}
 
 
-def _layer_names(file: Path) -> list[str]:
+def _layers_of(file: Path, result: Result) -> list[str]:
+    """Return the layers of the worker that hold what belongs in a result: areas alone are in its layer `elements`."""
     metadata = QgsProviderRegistry.instance().providerMetadata("ogr")
-    return [each.name() for each in metadata.querySublayers(str(file))]
+    found = {each.name(): each for each in metadata.querySublayers(str(file))}
+    areas = QgsWkbTypes.GeometryType.PolygonGeometry
+    return [
+        name
+        for name in result.layers
+        if name in found and (QgsWkbTypes.geometryType(found[name].wkbType()) == areas) == (result.kind == "polygon")
+    ]
 
 
 def _open(file: Path, layer: str) -> QgsVectorLayer:
     options = QgsVectorLayer.LayerOptions()
     options.loadDefaultStyle = False
     return QgsVectorLayer(f"{file}|layername={layer}", layer, "ogr", options)
-
-
-def destination_text(value: Any) -> str:
-    """Return what the user gave as a destination: a file, a table of a database, or a word for a temporary layer."""
-    if isinstance(value, QgsProcessingOutputLayerDefinition):
-        value = value.sink.staticValue()
-    return str(value or "")
 
 
 def _named_fields(wanted: list[QgsField], destination: str) -> QgsFields:
@@ -163,7 +165,7 @@ def _named_fields(wanted: list[QgsField], destination: str) -> QgsFields:
 
 
 def _copy(layer: QgsVectorLayer, sink: QgsFeatureSink, fields: QgsFields, kept: list[int], result: Result) -> None:
-    for chunk in _chunks(layer):
+    for chunk in in_chunks(layer.getFeatures()):
         rows = []
         for feature in chunk:
             values = feature.attributes()
@@ -173,12 +175,6 @@ def _copy(layer: QgsVectorLayer, sink: QgsFeatureSink, fields: QgsFields, kept: 
             rows.append(row)
         if not sink.addFeatures(rows, QgsFeatureSink.Flag.FastInsert):
             raise QgsProcessingException(tr("{} cannot be written: {}").format(result.title, sink.lastError()))
-
-
-def _chunks(layer: QgsVectorLayer) -> Iterator[list[QgsFeature]]:
-    several = layer.getFeatures()
-    while chunk := list(islice(several, _CHUNK)):
-        yield chunk
 
 
 def _prepare_loading(

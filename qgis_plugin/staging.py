@@ -22,6 +22,7 @@ from qgis.core import (
     QgsFeatureIterator,
     QgsFeatureRequest,
     QgsFeatureSink,
+    QgsFeedback,
     QgsField,
     QgsFields,
     QgsProcessingException,
@@ -34,6 +35,7 @@ from qgis.core import (
 from qgis.PyQt.QtCore import QCoreApplication, QDateTime, Qt, QTime
 
 from .compat import DATE_AND_TIME, INTEGER, PLAIN_TYPES, TEXT
+from .destinations import Place
 from .progress import Part
 from .translation import tr
 
@@ -86,6 +88,16 @@ def layer_inputs(layers: Sequence[QgsVectorLayer], *, selected_only: bool = Fals
 def file_of(layer: QgsVectorLayer) -> str:
     """Return the file that a layer lies in; empty for a layer that lies in none."""
     return str(QgsProviderRegistry.instance().decodeUri(layer.providerType(), layer.source()).get("path", ""))
+
+
+def place_of_layer(layer: QgsVectorLayer) -> Place:
+    """Return where a layer lies in its file."""
+    providers = QgsProviderRegistry.instance()
+    table = providers.decodeUri(layer.providerType(), layer.source()).get("layerName")
+    if not table and layer.providerType() == "ogr":  # QGIS takes the first one
+        found = providers.providerMetadata("ogr").querySublayers(file_of(layer))
+        table = found[0].name() if found else ""
+    return Place(file_of(layer), table or "")
 
 
 def layer_input(layer: QgsVectorLayer, *, selected_only: bool = False) -> Input:
@@ -155,13 +167,13 @@ def stage_layer(given: Input, file: Path, layer: str, part: Part, *, spatial: bo
         If it cannot be written, or the user cancels.
     """
     kept = [n for n, field in enumerate(given.fields) if field.name() != given.id_column]
-    precise = _with_fractions(given, kept)
+    precise = _with_fractions(given, kept, part.feedback)
     as_text = [n in precise or given.fields[n].type() not in PLAIN_TYPES for n in kept]
     fields = _fields([given.fields[n] for n in kept], as_text)
     file.parent.mkdir(exist_ok=True)
     writer = _writer(given, fields, file, layer, spatial=spatial)
     done = 0
-    for chunk in _chunks(given.read(QgsFeatureRequest())):
+    for chunk in in_chunks(given.read(QgsFeatureRequest())):
         QCoreApplication.processEvents()  # qgis_process hears Ctrl-C in its event loop only
         if part.feedback.isCanceled():
             raise QgsProcessingException(tr("Cancelled; nothing was written."))
@@ -175,13 +187,15 @@ def stage_layer(given: Input, file: Path, layer: str, part: Part, *, spatial: bo
 _FAST = QgsFeatureSink.Flag.FastInsert
 
 
-def _with_fractions(given: Input, columns: Sequence[int]) -> set[int]:
+def _with_fractions(given: Input, columns: Sequence[int], feedback: QgsFeedback) -> set[int]:
     """Return the columns of times with fractions of a second, which QGIS would cut off; frames are ordered by them."""
     times = [n for n in columns if given.fields[n].type() == DATE_AND_TIME]
     found: set[int] = set()
     if times:
         bare = QgsFeatureRequest().setSubsetOfAttributes(times).setFlags(QgsFeatureRequest.Flag.NoGeometry)
         for feature in given.read(bare):
+            if feedback.isCanceled():
+                break
             values = feature.attributes()
             found |= {n for n in times if isinstance(values[n], QDateTime) and values[n].time().msec()}
     return found
@@ -223,7 +237,8 @@ def _cannot_be_written(given: Input, writer: QgsVectorFileWriter) -> QgsProcessi
     return QgsProcessingException(tr("Layer “{}” cannot be handed to the worker: {}").format(given.title, why))
 
 
-def _chunks(features: QgsFeatureIterator) -> Iterator[list[QgsFeature]]:
+def in_chunks(features: QgsFeatureIterator) -> Iterator[list[QgsFeature]]:
+    """Give features several thousand at a time."""
     several = iter(features)
     while chunk := list(islice(several, _CHUNK)):
         yield chunk

@@ -18,11 +18,12 @@ from qgis.core import (
 )
 from qgis.PyQt.QtGui import QIcon
 
+from ..destinations import Place, place_of
 from ..environment import EnvironmentMissing, worker_python
 from ..layout import icon_path, metadata
 from ..parameters import explained, option_arguments
 from ..progress import Part
-from ..results import Result, deliver, destination_text
+from ..results import Result, deliver
 from ..translation import tr
 from ..worker import run_worker, workspace
 
@@ -127,26 +128,33 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
         """Return the layers that come out."""
         return []
 
-    def files_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[str]:
-        """Return the files that a run reads."""
+    def places_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[Place]:
+        """Return the files that a run reads, and which layer of them."""
         del parameters, context
         return []
 
     def fault(self, parameters: Parameters, context: QgsProcessingContext) -> str:
         """Return what is wrong with the parameters, in a sentence; empty where nothing is."""
-        taken = {Path(file).resolve(): tr("a file that is read") for file in self.files_read(parameters, context)}
+        for each in self.parameterDefinitions():
+            given = parameters.get(each.name()) if each.type() == "crs" else None
+            if given and not self.parameterAsCrs(parameters, each.name(), context).isValid():
+                return tr("{} ({}) cannot be {}: QGIS knows no such CRS.").format(
+                    each.description(), each.name(), given
+                )
+        taken = [(place, tr("a file that is read")) for place in self.places_read(parameters, context)]
         outputs = {result.parameter: result.title for result in self.results()} | {"REPORT": tr("Report")}
         for name, title in outputs.items():
-            file = Path(destination_text(parameters.get(name)))
-            if not file.suffix:
-                continue  # a temporary layer, or a table of a database
-            if file.resolve() in taken:
-                return tr("{} would overwrite {}, {}: choose another file.").format(
-                    title, taken[file.resolve()], file.name
-                )
-            if name == "REPORT" and not file.absolute().parent.is_dir():
-                return tr("{} {} cannot be written: there is no such folder.").format(title, file)
-            taken[file.resolve()] = tr("the output {}").format(title)
+            place = place_of(parameters.get(name), context)
+            if place is None:
+                continue
+            for other, what in taken:
+                if place.replaces(other):
+                    message = tr("{} would overwrite {}, {}: choose another file.")
+                    return message.format(title, what, Path(place.file).name)
+            if place.folder_fault:
+                message = tr("{} cannot be written to {}: {}. Choose another folder.")
+                return message.format(title, place.file, tr(place.folder_fault))
+            taken.append((place, tr("the output {}").format(title)))
         return ""
 
     def checkParameterValues(self, parameters: Parameters, context: QgsProcessingContext) -> tuple[bool, str]:
@@ -164,10 +172,11 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
         self, parameters: Parameters, context: QgsProcessingContext, feedback: QgsProcessingFeedback
     ) -> bool:
         """Look at the parameters again: a model does not ask `checkParameterValues` of its steps."""
-        del feedback
         message = self.fault(parameters, context)
         if message:
             raise QgsProcessingException(message)
+        for name in parameters.keys() - {each.name() for each in self.parameterDefinitions()}:
+            feedback.pushWarning(tr("There is no parameter {}, so it is not used.").format(name))
         return True
 
     def stage(self, parameters: Parameters, context: QgsProcessingContext, folder: Path, part: Part) -> Staged:
@@ -219,7 +228,7 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
             found = json.loads(report.read_text(encoding="utf-8"))
             done: dict[str, Any] = dict(self.numbers(found))
             for result in self.results():
-                done.update(deliver(result, output, self, parameters, context))
+                done.update(deliver(result, output, self, parameters, context, feedback))
             copy_to = self.parameterAsFileOutput(parameters, "REPORT", context)
             if copy_to:
                 try:
@@ -238,4 +247,11 @@ def _unacceptable(definition: QgsProcessingParameterDefinition, value: Any) -> s
         message = tr("{} ({}): {} cannot be opened as a layer; look whether it is there.")
         return message.format(definition.description(), definition.name(), shown)
     message = tr("{} ({}) cannot be {}. {}")
-    return message.format(definition.description(), definition.name(), shown or tr("empty"), definition.help())
+    allowed = _allowed(definition) or definition.help()
+    return message.format(definition.description(), definition.name(), shown or tr("empty"), allowed)
+
+
+def _allowed(definition: QgsProcessingParameterDefinition) -> str:
+    if definition.type() in {"number", "distance"}:
+        return tr("It is a number from {:g} to {:g}.").format(definition.minimum(), definition.maximum())
+    return tr("It is one of {}.").format(", ".join(definition.options())) if definition.type() == "enum" else ""

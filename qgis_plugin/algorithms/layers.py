@@ -12,9 +12,10 @@ from qgis.core import (
     QgsWkbTypes,
 )
 
+from ..destinations import Place
 from ..parameters import is_known
 from ..progress import Part
-from ..staging import Input, crs_of, file_names, file_of, layer_input, layer_inputs, stage_layer
+from ..staging import Input, crs_of, file_names, file_of, layer_input, layer_inputs, place_of_layer, stage_layer
 from ..translation import tr
 from .base import Parameters, Staged, WorkerAlgorithm
 
@@ -85,19 +86,18 @@ class LayerAlgorithm(WorkerAlgorithm):
             stage_layer(given, file, layer, next(pieces), spatial=layer != _ALIASES)
         return Staged([f"--main-map={file}"], inputs, {**titles, str(file): f"“{title}”"})
 
-    def files_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[str]:
+    def places_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[Place]:
         """Return the files of the layers that lie in files."""
         layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
         layers += [self.parameterAsVectorLayer(parameters, name, context) for name in _MAIN_MAP]
-        files = [file_of(layer) for layer in layers if layer is not None]
-        return [file for file in files if file]
+        return [place_of_layer(layer) for layer in layers if isinstance(layer, QgsVectorLayer) and file_of(layer)]
 
     def fault(self, parameters: Parameters, context: QgsProcessingContext) -> str:
         """Return what is wrong with the layers, as far as QGIS can know."""
         return (
             super().fault(parameters, context)
-            or self._unopened(parameters, context)
             or self._contradiction(parameters, context)
+            or self._unopened(parameters, context)
             or self._unfit(parameters, context)
         )
 
@@ -105,12 +105,19 @@ class LayerAlgorithm(WorkerAlgorithm):
         """Name a layer that Processing would pass over in silence."""
         given = parameters.get("LOCAL_MAPS")
         opened = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
-        if isinstance(given, (list, tuple)) and len(opened) < len(given):
-            return tr("One of the layers to merge cannot be opened: choose the layers again.")
+        if isinstance(given, (list, tuple)) and (
+            len(opened) < len(given) or not all(isinstance(layer, QgsVectorLayer) for layer in opened)
+        ):
+            return tr("One of the layers to merge cannot be opened as a vector layer: choose the layers again.")
         for name in _MAIN_MAP:
             if parameters.get(name) and self.parameterAsVectorLayer(parameters, name, context) is None:
                 title = self.parameterDefinition(name).description()
                 return tr("The layer that is given as {} ({}) cannot be opened: choose it again.").format(title, name)
+        aliases = self.parameterAsVectorLayer(parameters, "MAIN_MAP_ALIASES", context)
+        if aliases is not None and any(aliases.fields().lookupField(name) < 0 for name in ("old_id", "element_id")):
+            return tr("Layer “{}” is no table of retired ids, which has the columns old_id and element_id.").format(
+                aliases.name()
+            )
         return ""
 
     def _contradiction(self, parameters: Parameters, context: QgsProcessingContext) -> str:

@@ -77,7 +77,7 @@ class MergeLocalMaps(LayerAlgorithm):
             Result(
                 "OUTPUT",
                 tr("Merged map"),
-                "elements",
+                ("elements",),
                 "line",
                 tr("One line for each element, with its id, class, mean score and number of observations."),
                 style="merged_map",
@@ -87,16 +87,16 @@ class MergeLocalMaps(LayerAlgorithm):
             Result(
                 "AREAS",
                 tr("Merged areas"),
-                "elements_areas",
+                ("elements_areas", "elements"),
                 "polygon",
                 tr("The elements that are areas, such as pedestrian crossings that came as polygons."),
                 style="merged_areas",
-                like="elements",
+                precious=True,
             ),
             Result(
                 "LINEAGE",
                 tr("Lineage"),
-                "lineage",
+                ("lineage",),
                 "table",
                 tr("Which stretch of which input feature went into which element."),
                 style="lineage",
@@ -105,7 +105,7 @@ class MergeLocalMaps(LayerAlgorithm):
             Result(
                 "LEFT_OUT",
                 tr("Left out"),
-                "left_out",
+                ("left_out",),
                 "table",
                 tr("What is in no element, with the reason."),
                 style="left_out",
@@ -113,11 +113,11 @@ class MergeLocalMaps(LayerAlgorithm):
             Result(
                 "ID_ALIASES",
                 tr("Retired ids"),
-                "id_aliases",
+                ("id_aliases",),
                 "table",
                 tr("The ids of elements of a main map that became part of another one."),
                 style="id_aliases",
-                wanted=False,
+                precious=True,
             ),
         ]
 

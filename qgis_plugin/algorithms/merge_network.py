@@ -42,7 +42,7 @@ class MergeNetwork(LayerAlgorithm):
             Result(
                 "OUTPUT",
                 tr("Network: observations"),
-                "observations",
+                ("observations",),
                 "line",
                 tr("The lines, and the outlines of areas, with the number of the component that becomes one element."),
                 style="network_observations",
@@ -52,7 +52,7 @@ class MergeNetwork(LayerAlgorithm):
             Result(
                 "EDGES",
                 tr("Network: edges"),
-                "edges",
+                ("edges",),
                 "line",
                 tr("A link between the middles of each two observations that are merged, with their distance."),
                 style="network_edges",

@@ -7,6 +7,7 @@ from typing import Any
 
 from qgis.core import QgsProcessingContext, QgsProcessingParameterCrs, QgsProcessingParameterDefinition
 
+from ..destinations import Place
 from ..parameters import absolute_file, choice_parameter, explained, file_parameter, switch_parameter, text_parameter
 from ..progress import Part
 from ..results import Result
@@ -81,10 +82,10 @@ class ProjectLocalMaps(WorkerAlgorithm):
             text_parameter("DRIVE", tr("Name of the drive"), tr("Empty: the name of the predictions' file.")),
         ]
 
-    def files_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[str]:
+    def places_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[Place]:
         """Return the predictions, the poses and the matrix."""
         files = [self.parameterAsFile(parameters, name, context) for name in ("PREDICTIONS", "POSES", "LIDAR_TO_EGO")]
-        return [file for file in files if file]
+        return [Place(file) for file in files if file]
 
     def fault(self, parameters: Parameters, context: QgsProcessingContext) -> str:
         """Ask for a CRS, or for the word that there is none."""
@@ -107,7 +108,7 @@ class ProjectLocalMaps(WorkerAlgorithm):
             Result(
                 "OUTPUT",
                 tr("Local maps"),
-                "local_maps",
+                ("local_maps",),
                 "line",
                 tr("One line for each prediction, with its class, drive, frame, score and time."),
                 style="local_maps",
@@ -117,7 +118,7 @@ class ProjectLocalMaps(WorkerAlgorithm):
             Result(
                 "INSTANCES",
                 tr("Footprints"),
-                "instances",
+                ("instances",),
                 "polygon",
                 tr("What the predictor looked at in each frame, those included in which it saw nothing."),
                 style="instances",
@@ -125,7 +126,7 @@ class ProjectLocalMaps(WorkerAlgorithm):
             Result(
                 "LEFT_OUT",
                 tr("Left out"),
-                "left_out",
+                ("left_out",),
                 "table",
                 tr("Predictions that cannot be used, with the reason."),
                 style="left_out",

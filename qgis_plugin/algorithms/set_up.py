@@ -96,6 +96,8 @@ class SetUp(PolyMergeAlgorithm):
         elif self.parameterAsBoolean(parameters, "USE_AS_IS", context):
             _check(python, feedback)
             use_interpreter(python)
+        elif wheels and not Path(wheels).is_dir():
+            raise QgsProcessingException(tr("There is no folder {}: choose the folder of wheels again.").format(wheels))
         else:
             python = _make(python, wheels, feedback)
             use_interpreter("")
@@ -114,7 +116,7 @@ def _present() -> str:
 def _make(python: str, wheels: str, feedback: QgsProcessingFeedback) -> str:
     """Make an environment and return its interpreter."""
     source = ["--no-index", f"--find-links={wheels}"] if wheels else []
-    with new_environment() as folder:
+    with new_environment(python) as folder:
         _step(feedback, 0, tr("Looking at {}").format(python))
         unfit = tr("{} cannot make an environment ({}): choose another Python.")
         _run(python, [_CHECK], feedback, unfit, isolated=True)
@@ -181,4 +183,6 @@ def _run(
         raise QgsProcessingException(tr("Cancelled; the environment is as it was before."))
     if not ended.well:
         errors = [line for line in said if line.startswith("ERROR: ")]  # pip says more after it
-        raise QgsProcessingException(failure.format(python, ended.not_started or (errors or said or ["?"])[-1]))
+        raise QgsProcessingException(
+            failure.format(python, ended.not_started or (errors or said or [tr("it says nothing")])[-1])
+        )

@@ -268,3 +268,17 @@ class TestTransformCoordinates:
         there = transform_coordinates(given, pyproj.CRS(32632), pyproj.CRS(4326))
         back = transform_coordinates(there, pyproj.CRS(4326), pyproj.CRS(32632))
         assert shapely.hausdorff_distance(LineString(given), LineString(back)) < 1e-8
+
+
+class TestLayersFarApart:
+    def looks(self, longitude):
+        here = LineString([(9.0, 50.0), (9.001, 50.0)])
+        there = LineString([(longitude, 50.0), (longitude + 0.001, 50.0)])
+        return [gpd.GeoDataFrame(geometry=[line], crs=4326) for line in (here, there)]
+
+    def test_a_plane_that_cannot_hold_them_is_told(self):
+        warnings = merge(self.looks(60.0)).report["warnings"]
+        assert any("so far apart that lengths and the proximity are up to" in text for text in warnings)
+
+    def test_those_within_a_plane_are_merged_without_a_word(self):
+        assert merge(self.looks(9.5)).report["warnings"] == []

@@ -19,6 +19,7 @@ from qgis.core import (
     QgsProcessingOutputNumber,
     QgsProcessingParameterDefinition,
     QgsProcessingParameterFeatureSink,
+    QgsProperty,
     QgsVectorFileWriter,
     QgsVectorLayer,
     QgsWkbTypes,
@@ -135,7 +136,7 @@ class TestEvery:
         wanted = {
             "setup": {"PYTHON", "USE_AS_IS", "WHEELS", "CHECK_ONLY"},
             "projectlocalmaps": files | {"CRS", "POSE_KIND", "OUTPUT", "INSTANCES", "LEFT_OUT"},
-            "mergelocalmaps": layers | {"AREAS", "LINEAGE", "LEFT_OUT"},
+            "mergelocalmaps": layers | {"AREAS", "LINEAGE", "LEFT_OUT", "ID_ALIASES"},
             "mergenetwork": layers | {"EDGES"},
         }
         assert plain == wanted[name]
@@ -163,9 +164,7 @@ class TestOutputs:
             if isinstance(each, QgsProcessingParameterFeatureSink)
         ]
         assert [each.name() for each in sinks if not each.flags() & optional] == ["OUTPUT"]
-        assert [each.name() for each in sinks if not each.createByDefault()] == (
-            ["ID_ALIASES"] if name == "mergelocalmaps" else []
-        )
+        assert all(each.createByDefault() for each in sinks)
 
     @pytest.mark.parametrize("name", WORKERS)
     def test_each_layer_has_a_style(self, name):
@@ -341,6 +340,21 @@ class TestOutputsThatWouldOverwrite:
         )
         assert message == "Lineage would overwrite the output Merged map, map.gpkg: choose another file."
 
+    def test_a_table_in_the_file_of_a_layer_is_refused_where_it_is_that_layer_only(self, context, file, path):
+        table = "ogr:dbname='{}' table=\"{}\" (geom)"
+        same = table.format(path, file.name())
+        assert "Merged map would overwrite" in check("mergelocalmaps", context, LOCAL_MAPS=[file], OUTPUT=same)
+        assert check("mergelocalmaps", context, LOCAL_MAPS=[file], OUTPUT=table.format(path, "merged")) == ""
+
+    def test_an_expression_is_looked_through(self, context, file, path):
+        same = QgsProperty.fromExpression(f"'{path}'")
+        assert "Merged map would overwrite" in check("mergelocalmaps", context, LOCAL_MAPS=[file], OUTPUT=same)
+
+    def test_a_folder_that_is_not_there_is_told_before_the_work(self, context, tmp_path):
+        missing = str(tmp_path / "no" / "map.gpkg")
+        told = check("mergelocalmaps", context, LOCAL_MAPS=[memory_layer([track()])], OUTPUT=missing)
+        assert told == (f"Merged map cannot be written to {missing}: there is no such folder. Choose another folder.")
+
     def test_the_predictions_are_refused(self, context):
         given = {"PREDICTIONS": "/data/p.json", "POSES": "/data/p.csv", "CRS": "EPSG:32632"}
         assert "Report would overwrite" in check("projectlocalmaps", context, **given, REPORT="/data/p.json")
@@ -390,3 +404,24 @@ class TestFaultsOfProjecting:
     def test_needs_the_files(self, context):
         assert "PREDICTIONS" in check("projectlocalmaps", context, POSES="/p.csv", CRS="EPSG:32617")
         assert "POSES" in check("projectlocalmaps", context, PREDICTIONS="/p.json", CRS="EPSG:32617")
+
+
+class TestWhatProcessingPassesOver:
+    """Values that QGIS itself would ignore without a word."""
+
+    def test_an_unknown_crs(self, context):
+        told = check("mergelocalmaps", context, LOCAL_MAPS=[memory_layer([track()])], OUT_CRS="garbage")
+        assert told == "CRS of the result (OUT_CRS) cannot be garbage: QGIS knows no such CRS."
+
+    def test_a_misspelled_parameter(self, ready, run, feedback):
+        run("mergelocalmaps", LOCAL_MAPS=[memory_layer([track()])], OUTPUT="memory:", PROXIMTY=15)
+        assert "There is no parameter PROXIMTY, so it is not used." in feedback.warnings
+
+    def test_a_table_of_something_else_as_retired_ids(self, context):
+        layer = memory_layer([track()])
+        told = check("mergelocalmaps", context, LOCAL_MAPS=[layer], MAIN_MAP=layer, MAIN_MAP_ALIASES=layer)
+        assert "is no table of retired ids" in told
+
+    def test_numbers_out_of_range_are_told_the_range(self, context):
+        told = check("mergelocalmaps", context, LOCAL_MAPS=[memory_layer([track()])], PROXIMITY=-5)
+        assert told == "Proximity (PROXIMITY) cannot be -5. It is a number from 0 to 1000."

@@ -40,7 +40,7 @@ def fill(folder: Path) -> str:
 @pytest.fixture
 def made(own_profile) -> str:
     """An environment in the profile; its interpreter."""
-    with new_environment() as folder:
+    with new_environment(sys.executable) as folder:
         return fill(folder)
 
 
@@ -106,7 +106,7 @@ class TestUseInterpreter:
 
 class TestNewEnvironment:
     def test_replaces_the_old_one_and_removes_it(self, made, own_profile):
-        with new_environment() as folder:
+        with new_environment(sys.executable) as folder:
             python = fill(folder)
             assert worker_python() == made
         assert worker_python() == python
@@ -116,7 +116,7 @@ class TestNewEnvironment:
     @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
     def test_that_fails_leaves_the_old_one_and_no_trace(self, made, own_profile, error):
         before = sorted(each.name for each in own_profile.iterdir())
-        with pytest.raises(error), new_environment():
+        with pytest.raises(error), new_environment(sys.executable):
             raise error
         assert worker_python() == made
         assert sorted(each.name for each in own_profile.iterdir()) == before
@@ -128,7 +128,7 @@ class TestNewEnvironment:
             raise OSError("the disk is full")
 
         monkeypatch.setattr(Path, "write_text", refuse)
-        with pytest.raises(OSError, match="disk is full"), new_environment():
+        with pytest.raises(OSError, match="disk is full"), new_environment(sys.executable):
             pass
         assert worker_python() == made
         assert sorted(each.name for each in own_profile.iterdir()) == before

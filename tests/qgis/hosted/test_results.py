@@ -46,10 +46,12 @@ ELEMENTS = [("a1", "divider", 3, 2, 20.5, NULL), ("b2", "stairs", 1, 1, 4.25, "�
 LINES = [f"LINESTRING({EAST} {NORTH}, {EAST + 5} {NORTH})", f"LINESTRING({EAST} {NORTH + 9}, {EAST + 5} {NORTH})"]
 
 OUTPUT = Result(
-    "OUTPUT", "Merged map", "elements", "line", "The map.", style="merged_map", optional=False, shown_empty=True
+    "OUTPUT", "Merged map", ("elements",), "line", "The map.", style="merged_map", optional=False, shown_empty=True
 )
-AREAS = Result("AREAS", "Merged areas", "elements_areas", "polygon", "Areas.", style="merged_areas", like="elements")
-LINEAGE = Result("LINEAGE", "Lineage", "lineage", "table", "Who went where.", style="lineage", shown_empty=True)
+AREAS = Result(
+    "AREAS", "Merged areas", ("elements_areas", "elements"), "polygon", "Areas.", style="merged_areas", precious=True
+)
+LINEAGE = Result("LINEAGE", "Lineage", ("lineage",), "table", "Who went where.", style="lineage", shown_empty=True)
 
 pytestmark = pytest.mark.usefixtures("provider")
 
@@ -85,12 +87,12 @@ def file(tmp_path):
 
 
 @pytest.fixture
-def send(context, provider, file):
+def send(context, provider, file, feedback):
     """Return a function that delivers a result, and opens it."""
     algorithm = provider.algorithm("mergelocalmaps").create()
 
     def go(result, destination, path=file):
-        found = deliver(result, path, algorithm, {result.parameter: destination}, context)
+        found = deliver(result, path, algorithm, {result.parameter: destination}, context, feedback)
         return found.get(result.parameter), QgsProcessingUtils.mapLayerFromString(
             found.get(result.parameter, ""), context
         )
@@ -185,6 +187,23 @@ class TestWhatIsNotThere:
         path = tmp_path / "unknown.gpkg"
         write(path, "elements", ELEMENT_COLUMNS, [], kind=QgsWkbTypes.Type.Unknown)
         assert send(result, "memory:", path)[1].wkbType() == kind
+
+    def test_areas_alone_come_out_as_areas_and_leave_no_lines(self, send, tmp_path):
+        path = tmp_path / "areas.gpkg"
+        square = f"POLYGON(({EAST} {NORTH}, {EAST + 5} {NORTH}, {EAST + 5} {NORTH + 5}, {EAST} {NORTH}))"
+        write(path, "elements", ELEMENT_COLUMNS, ELEMENTS[:1], [square], kind=QgsWkbTypes.Type.Polygon)
+        _, areas = send(AREAS, "memory:", path)
+        _, lines = send(OUTPUT, "memory:", path)
+        assert (areas.featureCount(), areas.wkbType()) == (1, QgsWkbTypes.Type.Polygon)
+        assert (lines.featureCount(), lines.wkbType()) == (0, QgsWkbTypes.Type.LineString)
+        assert [field.name() for field in areas.fields()] == [field.name() for field in lines.fields()]
+
+    def test_areas_that_nobody_asked_for_are_told(self, send, tmp_path, feedback):
+        path = tmp_path / "areas.gpkg"
+        square = f"POLYGON(({EAST} {NORTH}, {EAST + 5} {NORTH}, {EAST + 5} {NORTH + 5}, {EAST} {NORTH}))"
+        write(path, "elements", ELEMENT_COLUMNS, ELEMENTS[:1], [square], kind=QgsWkbTypes.Type.Polygon)
+        assert send(AREAS, None, path)[0] is None
+        assert feedback.warnings == ["1 features of “Merged areas” are not kept: name an output for them (AREAS)."]
 
     def test_a_layer_that_the_worker_left_away_is_empty_with_the_columns_of_its_like(self, send):
         _, layer = send(AREAS, "memory:")

@@ -125,7 +125,7 @@ class TestMakingFails:
                 "echo 'it is Python 3.9.1, and more is needed'; exit 1",
                 "(it is Python 3.9.1, and more is needed): choose another",
             ),
-            ("able", "exit 1", "cannot make an environment (?): choose another Python."),
+            ("able", "exit 1", "cannot make an environment (it says nothing): choose another Python."),
             ("venv", "echo 'No space left on device'; exit 1", "cannot make an environment (No space left on device)."),
             (
                 "pip",
@@ -245,4 +245,4 @@ class TestParameters:
 
 def test_note_is_readable_by_a_person(run, python, own_profile):
     run("setup", PYTHON=python())
-    assert set(json.loads((own_profile / "made.json").read_text())) == {"folder", "requirements"}
+    assert set(json.loads((own_profile / "made.json").read_text())) == {"folder", "requirements", "made_with"}
