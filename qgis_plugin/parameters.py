@@ -118,19 +118,11 @@ def column_parameters() -> list[QgsProcessingParameterDefinition]:
             (AUTOMATIC, "column", "layer", "feature"),
         ),
         _field("SCORE_FIELD", tr("Score column"), tr("Confidence from 0 to 1. Empty: score, if any; else 1.")),
-        explained(
-            with_decimals(
-                QgsProcessingParameterNumber(
-                    "MIN_SCORE",
-                    tr("Lowest score"),
-                    type=QgsProcessingParameterNumber.Type.Double,
-                    defaultValue=0.0,
-                    minValue=0.0,
-                    maxValue=1.0,
-                )
-            ),
+        share_parameter(
+            "MIN_SCORE",
+            tr("Lowest score"),
             tr("Features with a lower score are left out, and listed there."),
-            advanced=True,
+            default=0.0,
         ),
         _field("TIMESTAMP_FIELD", tr("Time column"), tr("Orders the local maps. Empty: timestamp, if any.")),
         text_parameter(
@@ -144,19 +136,12 @@ def column_parameters() -> list[QgsProcessingParameterDefinition]:
 def map_parameters() -> list[QgsProcessingParameterDefinition]:
     """Return the rest of a main map, the CRS, and what to do with bad features."""
     return [
-        explained(
-            QgsProcessingParameterVectorLayer(
-                "MAIN_MAP_AREAS", tr("Areas of the main map"), types=[_AREAS], optional=True
-            ),
-            tr("Where the main map has its areas in a layer of their own."),
-            advanced=True,
-        ),
-        explained(
-            QgsProcessingParameterVectorLayer(
-                "MAIN_MAP_ALIASES", tr("Retired ids of the main map"), types=[_TABLE], optional=True
-            ),
+        _map_part("MAIN_MAP_AREAS", tr("Areas of the main map"), _AREAS, tr("Where they are in a layer of their own.")),
+        _map_part(
+            "MAIN_MAP_ALIASES",
+            tr("Retired ids of the main map"),
+            _TABLE,
             tr("The table of retired ids that came with the main map, so that no id is ever given twice."),
-            advanced=True,
         ),
         explained(
             QgsProcessingParameterCrs("CRS", tr("CRS of layers without one"), optional=True),
@@ -179,6 +164,23 @@ def map_parameters() -> list[QgsProcessingParameterDefinition]:
             tr("Otherwise such features are left out, and listed there with the reason."),
         ),
     ]
+
+
+def share_parameter(name: str, title: str, text: str, *, default: float) -> QgsProcessingParameterNumber:
+    """Return a number from 0 to 1."""
+    definition = QgsProcessingParameterNumber(
+        name,
+        title,
+        type=QgsProcessingParameterNumber.Type.Double,
+        defaultValue=default,
+        minValue=0.0,
+        maxValue=1.0,
+    )
+    return explained(with_decimals(definition), text, advanced=True)
+
+
+def _map_part(name: str, title: str, kind: Any, text: str) -> QgsProcessingParameterVectorLayer:
+    return explained(QgsProcessingParameterVectorLayer(name, title, types=[kind], optional=True), text, advanced=True)
 
 
 def choice_parameter(

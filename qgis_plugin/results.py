@@ -124,8 +124,8 @@ def deliver(
     sink, destination = algorithm.parameterAsSink(parameters, result.parameter, context, fields, kind, crs_of(layer))
     if sink is None and result.optional and not wanted:
         if result.precious and there and layer.featureCount():
-            message = tr("{} features of “{}” are not kept: name an output for them ({}).")
-            feedback.pushWarning(message.format(layer.featureCount(), result.title, result.parameter))
+            message = tr("What belongs in “{}” is not kept ({} in number): name an output for it as {}.")
+            feedback.pushWarning(message.format(result.title, layer.featureCount(), result.parameter))
         return {}
     if sink is None:
         raise QgsProcessingException(algorithm.invalidSinkError(parameters, result.parameter))

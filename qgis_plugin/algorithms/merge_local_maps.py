@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from qgis.core import QgsProcessingParameterDefinition, QgsProcessingParameterNumber
+from qgis.core import QgsProcessingParameterDefinition
 
 from ..parameters import (
     choice_parameter,
     column_parameters,
-    explained,
     layer_parameters,
     map_parameters,
+    share_parameter,
     text_parameter,
-    with_decimals,
 )
 from ..results import Result
 from ..translation import mark, tr
@@ -42,22 +41,15 @@ class MergeLocalMaps(LayerAlgorithm):
 
     def inputs(self) -> list[QgsProcessingParameterDefinition]:
         """Return the layers, their columns, and how to merge."""
-        coverage = QgsProcessingParameterNumber(
-            "COVERAGE",
-            tr("Coverage of areas"),
-            type=QgsProcessingParameterNumber.Type.Double,
-            defaultValue=0.5,
-            minValue=0.0,
-            maxValue=1.0,
-        )
         return [
             *layer_parameters(),
             *column_parameters(),
             choice_parameter("METHOD", tr("Method"), tr("polymerge: the method as it was published."), ("polymerge",)),
-            explained(
-                with_decimals(coverage),
+            share_parameter(
+                "COVERAGE",
+                tr("Coverage of areas"),
                 tr("The share of the observations of an area that must cover a place for it to belong to the area."),
-                advanced=True,
+                default=0.5,
             ),
             text_parameter(
                 "AGGREGATE",

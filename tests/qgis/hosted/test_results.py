@@ -203,7 +203,9 @@ class TestWhatIsNotThere:
         square = f"POLYGON(({EAST} {NORTH}, {EAST + 5} {NORTH}, {EAST + 5} {NORTH + 5}, {EAST} {NORTH}))"
         write(path, "elements", ELEMENT_COLUMNS, ELEMENTS[:1], [square], kind=QgsWkbTypes.Type.Polygon)
         assert send(AREAS, None, path)[0] is None
-        assert feedback.warnings == ["1 features of “Merged areas” are not kept: name an output for them (AREAS)."]
+        assert feedback.warnings == [
+            "What belongs in “Merged areas” is not kept (1 in number): name an output for it as AREAS."
+        ]
 
     def test_a_layer_that_the_worker_left_away_is_empty_with_the_columns_of_its_like(self, send):
         _, layer = send(AREAS, "memory:")
