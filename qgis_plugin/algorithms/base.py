@@ -137,7 +137,8 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
         """Return what is wrong with the parameters, in a sentence; empty where nothing is."""
         for each in self.parameterDefinitions():
             given = parameters.get(each.name()) if each.type() == "crs" else None
-            if given and not self.parameterAsCrs(parameters, each.name(), context).isValid():
+            # An invalid CRS as an object is how a widget may say that none is wanted; a text is a name that is wrong.
+            if isinstance(given, str) and given and not self.parameterAsCrs(parameters, each.name(), context).isValid():
                 return tr("{} ({}) cannot be {}: QGIS knows no such CRS.").format(
                     each.description(), each.name(), given
                 )

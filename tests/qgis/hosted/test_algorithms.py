@@ -413,6 +413,10 @@ class TestWhatProcessingPassesOver:
         told = check("mergelocalmaps", context, LOCAL_MAPS=[memory_layer([track()])], OUT_CRS="garbage")
         assert told == "CRS of the result (OUT_CRS) cannot be garbage: QGIS knows no such CRS."
 
+    def test_but_a_crs_that_is_not_chosen_is_none(self, context):
+        none = QgsCoordinateReferenceSystem()
+        assert check("mergelocalmaps", context, LOCAL_MAPS=[memory_layer([track()])], OUT_CRS=none) == ""
+
     def test_a_misspelled_parameter(self, ready, run, feedback):
         run("mergelocalmaps", LOCAL_MAPS=[memory_layer([track()])], OUTPUT="memory:", PROXIMTY=15)
         assert "There is no parameter PROXIMTY, so it is not used." in feedback.warnings
