@@ -1,6 +1,7 @@
 """Merge many overlapping, imperfect digitisations of the same lines into one clean map."""
 
 from polymerge_core.errors import CrsError, InputError, OptionError, OutputError, PolymergeError, SchemaError
+from polymerge_core.evaluation import Evaluation, evaluate
 from polymerge_core.formats import read_poses, read_predictions
 from polymerge_core.frames import project
 from polymerge_core.graph import merge_network, network_layers
@@ -12,6 +13,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "CrsError",
+    "Evaluation",
     "InputError",
     "LocalMaps",
     "MergeResult",
@@ -19,6 +21,7 @@ __all__ = [
     "OutputError",
     "PolymergeError",
     "SchemaError",
+    "evaluate",
     "merge",
     "merge_network",
     "network_layers",

@@ -21,6 +21,8 @@ _PACKAGES = (
     "pyarrow",
     "matplotlib",
     "click",
+    "jinja2",
+    "similaritymeasures",
 )
 
 

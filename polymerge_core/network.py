@@ -141,6 +141,33 @@ def merge_edges(
     return Edges(first, second, np.minimum(there, back))
 
 
+def check_pairs(
+    lines: NDArray[np.object_], others: NDArray[np.object_], proximity: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Find the pairs of a line and another one that pass `polyline_merge_check` (paper, Alg. 1).
+
+    Parameters
+    ----------
+    lines, others : ndarray of LineString
+        Metres.
+    proximity : float
+        Th_prox, metres.
+
+    Returns
+    -------
+    first, second : ndarray of int, shape (m,)
+        Positions in `lines` and in `others`, ordered by both.
+    """
+    first, second = shapely.STRtree(others).query(_boxes(lines, proximity))
+    check = _VertexCheck(np.concatenate([lines, others]), proximity)
+    found = list(check.passing(first, second + len(lines)))
+    if not found:
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    first, second = (np.concatenate(column) for column in zip(*found, strict=True))
+    order = np.lexsort((second, first))
+    return first[order], second[order] - len(lines)
+
+
 def components(count: int, edges: Edges) -> NDArray[np.intp]:
     """Find the connected components of a network.
 
