@@ -1,11 +1,13 @@
 """How long each stage takes, against reading and writing the same layers with geopandas in the same run.
 
-    python benchmarks/speed.py [--sizes 1000,10000,100000] [--hub 300,1000,3000] [-o speed.json]
+    python benchmarks/speed.py [--sizes 1000,10000,100000] [--hub 300,1000,3000] [--evaluate 1000,10000,100000]
+        [-o speed.json]
 
-Two cases. *Groups*: polylines of 20 vertices in independent groups of 15 looks at one line, so that the work grows
+Three cases. *Groups*: polylines of 20 vertices in independent groups of 15 looks at one line, so that the work grows
 with the number of groups. *Hub*: all polylines in one connected component, where the published method inserts every
-vertex into one base that keeps growing. Each size runs in a process of its own, whose peak memory is that of the
-whole run. Ratios and growth exponents are what to compare; seconds depend on the machine.
+vertex into one base that keeps growing. *Evaluate*: as many elements as reference lines, against reading both layers.
+Each size runs in a process of its own, whose peak memory is that of the whole run. Ratios and growth exponents are
+what to compare; seconds depend on the machine.
 """
 
 from __future__ import annotations
@@ -90,8 +92,42 @@ def measure(count: int, *, lines: int) -> dict[str, float]:
     return {"polylines": count, "elements": len(result.elements), "yardstick": yardstick, **seconds, "peak_mb": peak}
 
 
+def measure_evaluation(count: int) -> dict[str, float]:
+    """Time reading a map and its reference of as many lines, and evaluating the one against the other."""
+    with tempfile.TemporaryDirectory() as name:
+        files = [Path(name) / "reference.gpkg", Path(name) / "merged.gpkg"]
+        for file, shift in zip(files, (0.0, 0.3), strict=True):
+            layer = looks_at_lines(count, lines=count)
+            layer.set_geometry(layer.translate(0.0, shift)).to_file(file, layer="elements", VERSION="1.3")
+        pm.evaluate(layer.head(30), layer.head(30))
+        del layer
+        clock = [time.perf_counter()]
+        for file in files:
+            gpd.read_file(file)
+        clock.append(time.perf_counter())
+        reference, merged = (pm.read_local_maps([file]) for file in files)
+        clock.append(time.perf_counter())
+        pm.evaluate(merged, reference)
+        clock.append(time.perf_counter())
+        geopandas, read, evaluate = np.diff(clock).tolist()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {"polylines": count, "geopandas": geopandas, "read": read, "evaluate": evaluate, "peak_mb": peak}
+
+
+def evaluation_table(rows: list[dict[str, float]]) -> str:
+    """Lay the figures of evaluations out: seconds, and their ratio to reading both layers."""
+    lines = [f"{'elements':>10} {'geopandas reads':>16} {'PolyMerge reads':>16} {'evaluate':>10}   peak"]
+    for row in rows:
+        ratios = " and ".join(f"{row['evaluate'] / row[reader]:.0f} x" for reader in ("geopandas", "read"))
+        lines.append(
+            f"{row['polylines']:>10} {row['geopandas']:14.2f} s {row['read']:14.2f} s {row['evaluate']:8.2f} s "
+            f"{row['peak_mb']:6.0f} MB   {ratios} reading"
+        )
+    return "\n".join(lines)
+
+
 def measure_apart(case: str, count: int) -> dict[str, float]:
-    """Run `measure` in a process of its own."""
+    """Run one measurement in a process of its own."""
     command = [sys.executable, __file__, "--one", case, str(count)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return json.loads(done.stdout)
@@ -123,17 +159,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", default="1000,10000,100000", help="polylines in groups of 15")
     parser.add_argument("--hub", default="300,1000,3000", help="polylines in one component")
+    parser.add_argument("--evaluate", default="1000,10000,100000", help="elements against as many reference lines")
     parser.add_argument("-o", "--output", type=Path, help="JSON file for the figures")
     parser.add_argument("--one", nargs=2, metavar=("CASE", "COUNT"), help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.one:
         case, count = chosen.one[0], int(chosen.one[1])
-        print(json.dumps(measure(count, lines=1 if case == "hub" else max(1, count // LOOKS))))
+        lines = 1 if case == "hub" else max(1, count // LOOKS)
+        print(json.dumps(measure_evaluation(count) if case == "evaluate" else measure(count, lines=lines)))
         return
     figures = {}
-    for case, sizes in (("groups", chosen.sizes), ("hub", chosen.hub)):
+    for case, sizes in (("groups", chosen.sizes), ("hub", chosen.hub), ("evaluate", chosen.evaluate)):
         figures[case] = [measure_apart(case, int(size)) for size in sizes.split(",") if size]
-        print(f"{case}\n{table(figures[case])}\n")
+        layout = evaluation_table if case == "evaluate" else table
+        if figures[case]:
+            print(f"{case}\n{layout(figures[case])}\n")
     if chosen.output:
         chosen.output.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
 

@@ -92,6 +92,10 @@ def _instance_rank(parts: pd.DataFrame) -> NDArray[np.intp]:
             "is_main": "first",
         }
     )
+    if len(instances) == len(parts) and not (instances["kind"] == "column").any():
+        # Features that are a local map each: the same keys as below, without a loop over all of them.
+        keyed = parts[["timestamp_ns", "key", "content"]].assign(local=~parts["is_main"], start=drive_start)
+        return keyed.groupby(["local", "start", "timestamp_ns", "key", "content"]).ngroup().to_numpy()
     # The normalised WKB of all observations first; where it is the same, class, direction and columns.
     content = zip(_sorted_by(group, parts["key"]), _sorted_by(group, parts["content"]), strict=True)
     keys: list[tuple[Any, ...]] = []

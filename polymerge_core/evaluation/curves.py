@@ -87,9 +87,9 @@ class Curves:
         segment = np.searchsorted(self._laid, laid, side="right") - 1
         segment = np.clip(segment, self.bounds[line], self.bounds[line + 1] - 2)
         before, after = self._laid[segment], self._laid[segment + 1]
-        share = np.clip((laid - before) / (after - before), 0.0, 1.0)[:, None]
-        points: Array = self.vertices[segment] * (1 - share) + self.vertices[segment + 1] * share
-        return points
+        share = np.clip((laid - before) / (after - before), 0.0, 1.0)
+        axes = (axis[segment] * (1 - share) + axis[segment + 1] * share for axis in self.vertices.T)
+        return np.column_stack(tuple(axes))
 
     def locate(self, line: Index, points: Array) -> Array:
         """Return the positions of the projections of points onto lines (paper, eq. 2), shape (m,)."""

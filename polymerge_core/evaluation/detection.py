@@ -13,13 +13,11 @@ import shapely
 from numpy.typing import NDArray
 
 from polymerge_core.evaluation.curves import Array, Curves, Index, count_up
+from polymerge_core.evaluation.lengths import Followed
 from polymerge_core.evaluation.measures import METRES, NONE, Measure, mean_of
 
 #: Thresholds of the Chamfer distance, metres.
 THRESHOLDS_M = (0.5, 1.0, 1.5)
-
-#: Lines are followed at steps of at most this, metres.
-_STEP_M = 0.5
 
 #: Points held at once.
 _POINTS = 1_000_000
@@ -34,35 +32,45 @@ class Found(NamedTuple):
     distance: Array
 
 
-def nearest_elements(merged: Curves, reference: Curves) -> Found:
-    """Find for each element the reference element at the smallest Chamfer distance, among those near it."""
-    first, second = shapely.STRtree(reference.lines).query(merged.lines, predicate="dwithin", distance=THRESHOLDS_M[-1])
+def nearest_elements(merged: Followed, reference: Followed) -> Found:
+    """Find for each element the reference element at the smallest Chamfer distance, among those near it.
+
+    Parameters
+    ----------
+    merged, reference : Followed
+        The elements, each map followed along the other.
+    """
+    lines, others = merged.curves.lines, reference.curves.lines
+    first, second = shapely.STRtree(others).query(lines, predicate="dwithin", distance=THRESHOLDS_M[-1])
     distance = chamfer_distances(merged, reference, first, second)
     order = np.lexsort((second, distance, first))
     best = order[np.diff(first[order], prepend=-1) > 0]
-    found = Found(np.full(len(merged), -1), np.full(len(merged), np.inf))
+    found = Found(np.full(len(lines), -1), np.full(len(lines), np.inf))
     found.reference[first[best]], found.distance[first[best]] = second[best], distance[best]
     return found
 
 
-def chamfer_distances(merged: Curves, reference: Curves, first: Index, second: Index) -> Array:
+def chamfer_distances(merged: Followed, reference: Followed, first: Index, second: Index) -> Array:
     """Return the Chamfer distance of pairs, metres: the mean of the two ways' mean distance of points to the other."""
-    there = _mean_distances(merged, reference.lines, first, second)
-    back = _mean_distances(reference, merged.lines, second, first)
+    there = _mean_distances(merged, reference.curves, first, second)
+    back = _mean_distances(reference, merged.curves, second, first)
     return (there + back) / 2
 
 
-def _mean_distances(curves: Curves, lines: NDArray[np.object_], first: Index, second: Index) -> Array:
-    shapely.prepare(lines)
-    pieces = curves.pieces(_STEP_M)
+def _mean_distances(followed: Followed, others: Curves, first: Index, second: Index) -> Array:
+    curves, pieces, nearest = followed.curves, followed.pieces, followed.nearest
     counts = np.bincount(pieces.line, minlength=len(curves))
     starts = np.cumsum(counts) - counts
-    points = shapely.points(curves.points_at(pieces.line, pieces.middle))
     means = np.empty(len(first))
     portion = np.cumsum(counts[first]) // _POINTS
     for rows in np.split(np.arange(len(first)), np.flatnonzero(np.diff(portion)) + 1):
         owner, number = count_up(counts[first[rows]])
-        distance = shapely.distance(lines[second[rows]][owner], points[starts[first[rows]][owner] + number])
+        point, line = starts[first[rows]][owner] + number, second[rows][owner]
+        # Most points are nearest to the very line that they are to be measured to.
+        distance = nearest.distance[point]
+        rest = np.flatnonzero(nearest.line[point] != line)
+        middles = curves.points_at(pieces.line[point[rest]], pieces.middle[point[rest]])
+        distance[rest] = shapely.distance(others.lines[line[rest]], shapely.points(middles))
         means[rows] = np.bincount(owner, distance, minlength=len(rows)) / counts[first[rows]]
     return means
 

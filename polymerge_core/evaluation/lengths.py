@@ -140,6 +140,8 @@ def zigzag(name: str, followed: Followed, counts: Counts) -> Measure:
 def stretches_that_count(followed: Followed) -> tuple[Curves, Index]:
     """Return the stretches of a map that count, and the line of each; a line that counts as a whole stays as it is."""
     curves, pieces, counts = followed.curves, followed.pieces, followed.counts
+    if counts.all():
+        return curves, np.arange(len(curves))
     first = np.diff(pieces.line, prepend=-1) > 0
     begins = counts & (first | ~np.concatenate([[False], counts[:-1]]))
     run = np.cumsum(begins)[counts] - 1

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from polymerge_core.evaluation.curves import Array, Curves, Index, count_up
 
 #: Segments are cut so that none is longer than this, metres: a piece's middle then tells where the piece is.
-_PIECE_M = 1.0
+_PIECE_M = 2.0
 
 #: Points looked up at once.
 _CHUNK = 200_000
@@ -40,40 +40,43 @@ class NearestLine:
 
     def __init__(self, curves: Curves, limit: float) -> None:
         self._limit = limit
-        self._pieces(curves)
-        self._tree = cKDTree((self._start + self._stop) / 2)
-
-    def _pieces(self, curves: Curves) -> None:
         inner = np.ones(len(curves.vertices), dtype=bool)
         inner[curves.bounds[1:] - 1] = False
         first = np.flatnonzero(inner)
-        arc = curves.arc
-        a, b = curves.vertices[first], curves.vertices[first + 1]
-        counts = np.maximum(np.ceil((arc[first + 1] - arc[first]) / _PIECE_M), 1).astype(np.intp)
+        x, y = curves.vertices.T
+        length = curves.arc[first + 1] - curves.arc[first]
+        counts = np.maximum(np.ceil(length / _PIECE_M), 1).astype(np.intp)
         segment, number = count_up(counts)
-        low, high = (number / counts[segment])[:, None], ((number + 1) / counts[segment])[:, None]
-        self._start = a[segment] * (1 - low) + b[segment] * low
-        self._stop = a[segment] * (1 - high) + b[segment] * high
-        self._line: Index = curves.owner[first][segment]
-        self._from = arc[first][segment] + (arc[first + 1] - arc[first])[segment] * low[:, 0]
+        vertex = first[segment]
+        width = (length / counts)[segment]
+        # Axis by axis, as unit direction and length: what is asked millions of times.
+        self._ux, self._uy = (((axis[first + 1] - axis[first]) / length)[segment] for axis in (x, y))
+        self._x = x[vertex] + number * width * self._ux
+        self._y = y[vertex] + number * width * self._uy
+        self._length = width
+        self._line: Index = curves.owner[vertex]
+        self._from = curves.arc[vertex] + number * width
+        middles = [start + width / 2 * unit for start, unit in ((self._x, self._ux), (self._y, self._uy))]
+        self._tree = cKDTree(np.column_stack(middles), balanced_tree=False, compact_nodes=False)
 
     def __call__(self, points: Array) -> Nearest:
         """Look up points, shape (n, 2), metres."""
         found = Nearest(np.full(len(points), np.inf), np.full(len(points), -1), np.zeros(len(points)))
-        for start in range(0, len(points) if len(self._start) else 0, _CHUNK):
+        for start in range(0, len(points) if len(self._line) else 0, _CHUNK):
             self._look_up(points, np.arange(start, min(start + _CHUNK, len(points))), found)
         return found
 
     def _look_up(self, points: Array, rows: Index, found: Nearest) -> None:
         """Fill in the rows; a middle lies at most half a piece beyond its piece, so some must be asked again."""
-        count = 4
-        every = len(self._start)
+        count = 3
+        every = len(self._line)
+        near = self._limit + _PIECE_M / 2
         while len(rows):
-            near = self._limit + _PIECE_M / 2
+            asked = points[rows]
             middle, piece = self._tree.query(
-                points[rows], k=np.arange(1, min(count, every) + 1), distance_upper_bound=near
+                asked, k=np.arange(1, min(count, every) + 1), distance_upper_bound=near, workers=-1
             )
-            distance, along = self._measure(points[rows], np.minimum(piece, every - 1))
+            distance, along = self._measure(asked, np.minimum(piece, every - 1))
             distance[~np.isfinite(middle)] = np.inf
             best = np.argmin(distance, axis=1)
             pick = (np.arange(len(rows)), best)
@@ -88,10 +91,7 @@ class NearestLine:
 
     def _measure(self, points: Array, piece: Index) -> tuple[Array, Array]:
         """Return the distance to pieces, and how far along them the foot lies, metres, both of the shape of `piece`."""
-        start = self._start[piece]
-        direction = self._stop[piece] - start
-        length = np.hypot(direction[..., 0], direction[..., 1])
-        offset = points[:, None] - start
-        along = np.clip((offset * direction).sum(axis=-1) / length, 0.0, length)
-        foot = start + direction * (along / length)[..., None]
-        return np.hypot(*np.moveaxis(points[:, None] - foot, -1, 0)), along
+        dx, dy = points[:, :1] - self._x[piece], points[:, 1:] - self._y[piece]
+        ux, uy = self._ux[piece], self._uy[piece]
+        along = np.clip(dx * ux + dy * uy, 0.0, self._length[piece])
+        return np.hypot(dx - along * ux, dy - along * uy), along

@@ -167,7 +167,8 @@ def _judge(maps: Maps, name: str, chosen: str) -> _Judged:
     ]
     rest, overlap = _area_part(elements, truth, truth_followed)
     rest += _paired_part(maps, name, merged, reference)
-    rest += _detection_part(drawn, elements["score"].to_numpy(dtype=float)[element], truth_followed)
+    score = elements["score"].to_numpy(dtype=float)[element]
+    rest += _detection_part(followed, drawn, score, truth_followed)
     rest += lengths.coverage_measures(followed, truth_followed)
     rest += [
         lengths.duplication(followed, reference, to_reference),
@@ -220,9 +221,16 @@ def _paired_part(maps: Maps, name: str, merged: Curves, reference: Curves) -> li
     return paired.paired_measures(*paired.paired_errors(observations, merged, reference, whole))
 
 
-def _detection_part(drawn: Curves, score: NDArray[np.float64], truth_followed: lengths.Followed) -> list[Measure]:
+def _detection_part(
+    followed: lengths.Followed, drawn: Curves, score: NDArray[np.float64], truth_followed: lengths.Followed
+) -> list[Measure]:
     true, _ = lengths.stretches_that_count(truth_followed)
-    return detection.detection_measures(detection.nearest_elements(drawn, true), score, len(true))
+    if drawn is not followed.curves or true is not truth_followed.curves:
+        # Only what counts is there to be found, and to find.
+        limit = detection.THRESHOLDS_M[-1]
+        followed = lengths.follow(drawn, NearestLine(true, limit), region.everywhere)
+        truth_followed = lengths.follow(true, NearestLine(drawn, limit), region.everywhere)
+    return detection.detection_measures(detection.nearest_elements(followed, truth_followed), score, len(true))
 
 
 def _put_together(maps: Maps, judged: list[_Judged], sample: PcmSample | None, chosen: str) -> Evaluation:
@@ -344,10 +352,7 @@ def _typed(column: pd.Series) -> pd.Series:
     """Give ids the type that they have: whole numbers, else text."""
     if column.dtype != object:
         return column
-    whole = all(
-        value is None or (isinstance(value, (int, np.integer)) and not isinstance(value, bool)) for value in column
-    )
-    if whole:
+    if pd.api.types.infer_dtype(column, skipna=True) in ("integer", "empty"):
         return column.astype("Int64")
     return column.map(lambda value: None if value is None else str(value)).astype("str")
 
