@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 import geopandas as gpd
 import numpy as np
-import pandas as pd
 
 import polymerge_core as pm
 from polymerge_core import console
 from polymerge_core.crs import parse_crs
 from polymerge_core.environment import library_versions
+from polymerge_core.evaluation import REGION_FROM
 from polymerge_core.formats import read_matrix
-from polymerge_core.io import layer_targets, source_files, stage_layers
+from polymerge_core.job import Job, split_off
 from polymerge_core.options import AGGREGATES, INSTANCE_FROM, METHODS, Options
-from polymerge_core.outputs import StagedOutputs
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -106,12 +104,12 @@ def cli() -> None:
 @_run_options
 def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None, **chosen: Any) -> None:
     """Carry a predictor's local maps from the vehicle's frame into the world."""
-    run = _split_off(chosen)
+    run = split_off(chosen)
     for name, form in (("origin", "LAT,LON"), ("pose_offset", "E,N"), ("footprint", "XMIN,YMIN,XMAX,YMAX")):
         chosen[name] = _numbers(name, chosen[name], form)
     chosen["drive"] = chosen["drive"] or output.stem
     inputs = [predictions, poses, *([lidar_to_ego] if lidar_to_ego else [])]
-    with _Run(output, inputs, ["local_maps", "instances"], **run) as job:
+    with Job(output, inputs, ["local_maps", "instances"], **run) as job:
         job.progress(0.0, "reading the predictions")
         seen = pm.read_predictions(predictions)
         matrix = read_matrix(lidar_to_ego) if lidar_to_ego else None
@@ -143,11 +141,11 @@ def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None
 @_run_options
 def merge(local_maps: tuple[str, ...], output: Path, main_map: str | None, **chosen: Any) -> None:
     """Merge local maps (FILE, or FILE|layername=LAYER) into one map."""
-    run = _split_off(chosen)
+    run = split_off(chosen)
     chosen["aggregate"] = _aggregate(chosen["aggregate"])
     Options.of(**chosen)  # a wrong value is told before anything is read
     inputs = [*local_maps, *([] if main_map is None else [main_map])]
-    with _Run(output, inputs, ["elements"], tables=["lineage"], **run) as job:
+    with Job(output, inputs, ["elements"], tables=["lineage"], **run) as job:
         job.progress(0.0, "reading the files")
         layers = pm.read_local_maps(local_maps)
         into = None if main_map is None else pm.read_local_maps([main_map])
@@ -172,10 +170,10 @@ def merge(local_maps: tuple[str, ...], output: Path, main_map: str | None, **cho
 @_run_options
 def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **chosen: Any) -> None:
     """Write who would be merged with whom: layers edges and observations."""
-    run = _split_off(chosen)
+    run = split_off(chosen)
     Options.of(**chosen)
     inputs = [*local_maps, *([] if main_map is None else [main_map])]
-    with _Run(output, inputs, ["edges", "observations"], **run) as job:
+    with Job(output, inputs, ["edges", "observations"], **run) as job:
         job.progress(0.0, "reading the files")
         layers = pm.read_local_maps(local_maps)
         into = None if main_map is None else pm.read_local_maps([main_map])
@@ -198,6 +196,60 @@ def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **c
     )
 
 
+@cli.command()
+@click.argument("merged", metavar="MERGED")
+@click.option("--reference", multiple=True, required=True, metavar="TRUTH", help="The true map; repeatable.")
+@click.option("--local", "local_maps", multiple=True, metavar="LOCAL", help="What MERGED was made from; repeatable.")
+@click.option("--region", metavar="FILE", help="Polygons of the part that counts.")
+@click.option("--region-from", type=click.Choice(REGION_FROM), help="Which part of the reference counts.")
+@click.option("--pcm", is_flag=True, help="Work out partial curve mapping too, of at most 2,000 pairs.")
+@click.option("--class-field", help="Column of the class.  [default: class, if there is one]")
+@click.option("--class-name", default="line", show_default=True, help="The class where no column names one.")
+@click.option("--score-field", help="Column of the confidence, 0 to 1.  [default: score, else 1]")
+@click.option("--area", multiple=True, metavar="CLASS", help="A class of areas, beside ped_crossing; repeatable.")
+@click.option("--crs", callback=_known_crs, help="CRS of layers without one, such as EPSG:32632, or local.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="A page with tables and pictures, HTML.")
+@click.option("--layers", type=click.Path(path_type=Path), help="The errors along the lines, as layers.")
+@_run_options
+def evaluate(
+    merged: str,
+    reference: tuple[str, ...],
+    local_maps: tuple[str, ...],
+    region: str | None,
+    output: Path | None,
+    layers: Path | None,
+    **chosen: Any,
+) -> None:
+    """Measure how close the map MERGED (FILE, or FILE|layername=LAYER) is to a reference."""
+    run = split_off(chosen)
+    if output is not None and output.suffix.lower() not in {".html", ".htm"}:
+        raise pm.OptionError(
+            f"--output is a page, {output} has no name of one; end it in .html (--layers writes layers)"
+        )
+    inputs = [merged, *reference, *local_maps, *([] if region is None else [region])]
+    pages = [] if output is None else [output]
+    with Job(layers, inputs, ["errors", "evaluated"], tables=["measures"], pages=pages, **run) as job:
+        job.progress(0.0, "reading the files")
+        maps = [pm.read_local_maps(sources) for sources in ([merged], reference, local_maps)]
+        area = None if region is None else _region(region)
+        result = pm.evaluate(
+            maps[0], maps[1], local_maps=maps[2] or None, region=area, progress=job.progress.part(0.05, 0.8), **chosen
+        )
+        job.report(result.report)
+        if output is not None:
+            from polymerge_core.evaluation.page import render_page  # noqa: PLC0415 - matplotlib is slow to load
+
+            job.progress(0.8, "drawing")
+            job.page(output, render_page(result))
+        job.write(result.layers(), 0.95)
+    for warning in result.report["warnings"]:
+        console.say(f"warning: {warning}")
+    if run["report_file"] != "-":
+        click.echo(result.summary())
+    if job.written:
+        console.say(f"{_left_out(result.report['left_out']).removeprefix('; ') or 'done'} -> {job.written}")
+
+
 @cli.command("demo")
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default="polymerge_demo")
 @click.option("--overwrite", is_flag=True, help="Replace the outputs of an earlier run.")
@@ -217,79 +269,6 @@ def env() -> None:
         click.echo(f"{name} {version}")
 
 
-class _Run:
-    """One run of a command: its outputs appear together at the end, or not at all.
-
-    `layers` and `tables` are those that it writes whatever comes out.
-    """
-
-    def __init__(
-        self,
-        output: Path,
-        inputs: Sequence[str],
-        layers: Sequence[str],
-        *,
-        tables: Sequence[str] = (),
-        overwrite: bool,
-        report_file: str | None,
-        progress: console.ProgressMode,
-        watch_stdin: bool,
-    ) -> None:
-        self._output, self._report_file, self._printed = output, report_file, ""
-        if not all(inputs):
-            raise pm.OptionError("the name of an input is empty; name a file")
-        files = [file for path in inputs for file in source_files(path)]
-        self._outputs = StagedOutputs(overwrite=overwrite, inputs=files)
-        report = [Path(report_file)] if report_file not in (None, "-") else []
-        # All layers of a run are known at its end; those that are certain are checked before its work.
-        certain = {name: gpd.GeoDataFrame() for name in layers} | {name: pd.DataFrame() for name in tables}
-        self._outputs.check([*dict.fromkeys(layer_targets(output, certain).values()), *report])
-        self.progress = console.ProgressReport(progress)
-        self.written = str(output)
-        if watch_stdin:
-            console.watch_stdin()
-
-    def __enter__(self) -> _Run:  # noqa: PYI034 - typing.Self is newer than Python 3.10
-        self._outputs.__enter__()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        try:
-            self._outputs.__exit__(*error)  # type: ignore[arg-type]
-        finally:
-            self.progress.close()
-        if error[0] is None and self._printed:
-            # Whoever reads this may go on to the outputs, so they must be there.
-            click.echo(self._printed, nl=False)
-
-    def write(self, layers: dict[str, Any], fraction: float) -> None:
-        """Stage the layers; `fraction` is how far the run is when writing starts."""
-        self.progress(fraction, "writing")
-        done = stage_layers(self._outputs, self._output, layers)
-        self.written = ", ".join(path.name if path != self._output else str(path) for path in done.paths)
-        for layer, names in done.renamed.items():
-            for old, new in names.items():
-                console.say(f"column {old!r} of layer {layer!r} is called {new!r} in the file")
-        self.progress(1.0, "done")
-
-    def report(self, content: dict[str, Any]) -> None:
-        """Stage the JSON report, or keep it until the end where it goes to standard output."""
-        if self._report_file is None:
-            return
-        # Standard output may be a terminal that knows few letters.
-        printed = self._report_file == "-"
-        text = json.dumps(content, indent=2, ensure_ascii=printed, default=_plain) + "\n"
-        if printed:
-            self._printed = text
-        else:
-            self._outputs.stage(self._report_file).write_text(text, encoding="utf-8")
-
-
-def _split_off(chosen: dict[str, Any]) -> dict[str, Any]:
-    """Take the options of `_Run` out of a command's options."""
-    return {name: chosen.pop(name) for name in ("overwrite", "report_file", "progress", "watch_stdin")}
-
-
 def _numbers(name: str, text: str | None, form: str) -> tuple[float, ...] | None:
     """Read comma-separated numbers."""
     if text is None:
@@ -304,6 +283,14 @@ def _numbers(name: str, text: str | None, form: str) -> tuple[float, ...] | None
             f"--{name.replace('_', '-')} is {text!r}; it takes {count} numbers with commas between, {form}"
         )
     return numbers
+
+
+def _region(source: str) -> gpd.GeoSeries:
+    """Read the polygons of a file."""
+    layers = list(pm.read_layers(source).values())
+    if len(layers) > 1:
+        raise pm.InputError(f"{source} holds several layers; name the one of the region, FILE|layername=LAYER")
+    return layers[0].geometry
 
 
 def _aggregate(chosen: tuple[str, ...]) -> str | dict[str, str]:
@@ -325,13 +312,6 @@ def _left_out(reasons: dict[str, int]) -> str:
         return ""
     listed = ", ".join(f"{reason}: {count}" for reason, count in sorted(reasons.items()))
     return f"; {sum(reasons.values())} left out ({listed})"
-
-
-def _plain(value: Any) -> Any:
-    """Turn numpy's numbers into JSON's."""
-    if isinstance(value, np.generic):
-        return value.item()
-    return str(value)
 
 
 def main(arguments: list[str] | None = None) -> int:
