@@ -411,7 +411,9 @@ def beside_the_end(rng, before, end, after, *, count):
 def test_start_of_a_closed_base_reached_by_its_last_segment(rng, count):
     # By rounding, the foot on the first segment may lie farther off than the start itself.
     found = 0
-    for _ in range(200 if count == 0 else 60):
+    for _ in range(2000):
+        if found == 3:
+            break
         second, start, last = rng.uniform(0, 100, (3, 2))
         way_round = np.column_stack((np.linspace(second[0], last[0], count + 3)[1:-1], np.full(count + 1, -200)))
         ring = np.vstack((start, second, way_round, last, start))
