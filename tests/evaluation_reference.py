@@ -221,6 +221,10 @@ def duplication(merged, references):
             continue
         reference = references[number]
         low, high = sorted((project(piece.start, reference)[1], project(piece.end, reference)[1]))
+        if is_closed(reference) and high - low > length(reference) / 2:
+            near += piece.length
+            covered.setdefault(number, []).extend([(0.0, low), (high, length(reference))])
+            continue
         is_beyond = not is_closed(reference) and low == high and low in (0.0, length(reference))
         if is_beyond or high - low > 4 * piece.length:
             continue

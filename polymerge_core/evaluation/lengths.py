@@ -28,6 +28,9 @@ DISTANCES_M = (0.5, 1.0)
 # A piece whose ends fall this many times its length apart has leapt from one part of a line to another.
 _LEAP = 4.0
 
+# Positions along a line are known to this, metres.
+_ROUNDING_M = 1e-6
+
 
 @dataclass(frozen=True)
 class Followed:
@@ -101,21 +104,30 @@ def duplication(merged: Followed, reference: Curves, others: NearestLine) -> Mea
     # Piece by piece: both ends must fall on one line, and not beyond its end.
     line, start, stop = foot.line[first], foot.position[first], foot.position[first + 1]
     same = (line >= 0) & (line == foot.line[first + 1]) & merged.counts
-    beyond = ~reference.closed[line] & (start == stop) & ((start == 0.0) | (start == reference.length[line]))
-    used = same & ~beyond & (np.abs(stop - start) <= _LEAP * merged.pieces.length)
-    laid = np.cumsum(reference.length) - reference.length
-    low, high = (laid[line] + pick(start, stop) for pick in (np.minimum, np.maximum))
-    covered = _union(low[used], high[used])
+    # On a ring the shorter way counts, which may lead over its start.
+    around, length = reference.closed[line], reference.length[line]
+    stop = np.where(around, start + (stop - start + length / 2) % length - length / 2, stop)
+    still = np.abs(stop - start) <= _ROUNDING_M
+    at_end = (start <= _ROUNDING_M) | (start >= length - _ROUNDING_M)
+    used = same & ~(~around & still & at_end) & (np.abs(stop - start) <= _LEAP * merged.pieces.length)
+    covered = _union(reference, line[used], np.minimum(start, stop)[used], np.maximum(start, stop)[used])
     return ratio("duplication", NONE, float(merged.pieces.length[used].sum()), covered, int(used.sum()))
 
 
-def _union(low: Array, high: Array) -> float:
-    """Return the length that intervals cover together."""
+def _union(curves: Curves, line: Index, low: Array, high: Array) -> float:
+    """Return the length that intervals of lines cover together; those of rings may lead over the start."""
+    length = curves.length[line]
+    before, after = np.flatnonzero(low < 0), np.flatnonzero(high > length)
+    laid = (np.cumsum(curves.length) - curves.length)[line]
+    low, high = (
+        np.concatenate([laid + np.clip(low, 0, length), (laid + length + low)[before], laid[after]]),
+        np.concatenate([laid + np.clip(high, 0, length), (laid + length)[before], (laid + high - length)[after]]),
+    )
     order = np.argsort(low, kind="stable")
     low, high = low[order], high[order]
     reached = np.maximum.accumulate(high)
-    before = np.concatenate([low[:1], reached[:-1]])
-    return float(np.maximum(high - np.maximum(low, before), 0.0).sum())
+    before_it = np.concatenate([low[:1], reached[:-1]])
+    return float(np.maximum(high - np.maximum(low, before_it), 0.0).sum())
 
 
 def fragments(merged: Followed) -> Measure:
