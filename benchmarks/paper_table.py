@@ -148,7 +148,7 @@ def main() -> int:
     """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, help="folder of the real data; the simulated town without it")
-    parser.add_argument("--seeds", type=int, default=1, help="how many seeds of the simulated errors (1)")
+    parser.add_argument("--seeds", type=int, default=3, help="how many seeds of the simulated errors (3)")
     parser.add_argument("--no-pcm", action="store_true", help="leave the PCM out")
     parser.add_argument("--no-real-predictions", action="store_true", help="leave deecamp and openlane out")
     parser.add_argument("-o", "--output", type=Path, help="JSON file for the figures")

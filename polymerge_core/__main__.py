@@ -197,7 +197,7 @@ def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **c
 
 
 @cli.command()
-@click.argument("merged", metavar="MERGED")
+@click.argument("merged", metavar="MERGED", nargs=-1, required=True)
 @click.option("--reference", multiple=True, required=True, metavar="TRUTH", help="The true map; repeatable.")
 @click.option("--local", "local_maps", multiple=True, metavar="LOCAL", help="What MERGED was made from; repeatable.")
 @click.option("--region", metavar="FILE", help="Polygons of the part that counts.")
@@ -212,7 +212,7 @@ def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **c
 @click.option("--layers", type=click.Path(path_type=Path), help="The errors along the lines, as layers.")
 @_run_options
 def evaluate(
-    merged: str,
+    merged: tuple[str, ...],
     reference: tuple[str, ...],
     local_maps: tuple[str, ...],
     region: str | None,
@@ -220,17 +220,17 @@ def evaluate(
     layers: Path | None,
     **chosen: Any,
 ) -> None:
-    """Measure how close the map MERGED (FILE, or FILE|layername=LAYER) is to a reference."""
+    """Measure how close the map MERGED (FILE, or FILE|layername=LAYER; repeatable) is to a reference."""
     run = split_off(chosen)
     if output is not None and output.suffix.lower() not in {".html", ".htm"}:
         raise pm.OptionError(
             f"--output is a page, {output} has no name of one; end it in .html (--layers writes layers)"
         )
-    inputs = [merged, *reference, *local_maps, *([] if region is None else [region])]
+    inputs = [*merged, *reference, *local_maps, *([] if region is None else [region])]
     pages = [] if output is None else [output]
     with Job(layers, inputs, ["errors", "evaluated"], tables=["measures"], pages=pages, **run) as job:
         job.progress(0.0, "reading the files")
-        maps = [pm.read_local_maps(sources) for sources in ([merged], reference, local_maps)]
+        maps = [pm.read_local_maps(sources) for sources in (merged, reference, local_maps)]
         area = None if region is None else _region(region)
         result = pm.evaluate(
             maps[0], maps[1], local_maps=maps[2] or None, region=area, progress=job.progress.part(0.05, 0.8), **chosen

@@ -20,7 +20,7 @@ PLUGIN = "polymerge"
 #: that lies about (a journal of SQLite, a backup of an editor) is ever given to others.
 FILES = ("LICENSE", "README.md", "metadata.txt")
 FOLDERS = {
-    "polymerge_core": (".py", ".typed"),
+    "polymerge_core": (".j2", ".py", ".typed"),
     "qgis_plugin": (".py", ".txt"),
     "resources/icons": (".svg",),
     "resources/sample": (".csv", ".gpkg", ".json"),

@@ -133,16 +133,9 @@ def column_parameters() -> list[QgsProcessingParameterDefinition]:
     ]
 
 
-def map_parameters() -> list[QgsProcessingParameterDefinition]:
-    """Return the rest of a main map, the CRS, and what to do with bad features."""
+def crs_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return where layers without a CRS lie."""
     return [
-        _map_part("MAIN_MAP_AREAS", tr("Areas of the main map"), _AREAS, tr("Where they are in a layer of their own.")),
-        _map_part(
-            "MAIN_MAP_ALIASES",
-            tr("Retired ids of the main map"),
-            _TABLE,
-            tr("The table of retired ids that came with the main map, so that no id is ever given twice."),
-        ),
         explained(
             QgsProcessingParameterCrs("CRS", tr("CRS of layers without one"), optional=True),
             tr("Says where layers without a CRS lie; layers that have one are not touched by it."),
@@ -153,6 +146,20 @@ def map_parameters() -> list[QgsProcessingParameterDefinition]:
             tr("Layers without a CRS are in plain metres"),
             tr("Their coordinates are metres that lie nowhere on Earth; nothing is reprojected."),
         ),
+    ]
+
+
+def map_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return the rest of a main map, the CRS, and what to do with bad features."""
+    return [
+        _map_part("MAIN_MAP_AREAS", tr("Areas of the main map"), _AREAS, tr("Where they are in a layer of their own.")),
+        _map_part(
+            "MAIN_MAP_ALIASES",
+            tr("Retired ids of the main map"),
+            _TABLE,
+            tr("The table of retired ids that came with the main map, so that no id is ever given twice."),
+        ),
+        *crs_parameters(),
         explained(
             QgsProcessingParameterCrs("OUT_CRS", tr("CRS of the result"), optional=True),
             tr("Empty: that of the main map, else that of the first layer."),
@@ -223,9 +230,65 @@ def folder_parameter(name: str, title: str, text: str) -> QgsProcessingParameter
     return explained(QgsProcessingParameterFile(name, title, behavior=folder, optional=True), text)
 
 
-def _field(name: str, title: str, text: str) -> QgsProcessingParameterField:
-    definition = QgsProcessingParameterField(name, title, parentLayerParameterName="LOCAL_MAPS", optional=True)
+def _field(name: str, title: str, text: str, *, layers: str = "LOCAL_MAPS") -> QgsProcessingParameterField:
+    definition = QgsProcessingParameterField(name, title, parentLayerParameterName=layers, optional=True)
     return explained(definition, text, advanced=name != "CLASS_FIELD")
+
+
+def compared_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return what an evaluation reads."""
+
+    def several(name: str, title: str, text: str, *, optional: bool = False) -> QgsProcessingParameterMultipleLayers:
+        layers = QgsProcessingParameterMultipleLayers(name, title, layerType=_ANY, optional=optional)
+        layers.setMinimumNumberInputs(0 if optional else 1)
+        return explained(layers, text)
+
+    region = QgsProcessingParameterVectorLayer("REGION", tr("Region that counts"), types=[_AREAS], optional=True)
+    return [
+        several("MERGED", tr("Map to evaluate"), tr("The lines and areas of the map, or single observations.")),
+        several("REFERENCE", tr("Reference"), tr("The true map: lines and areas, in any CRS.")),
+        several(
+            "LOCAL_MAPS",
+            tr("Observations"),
+            tr("What the map was made from: for the comparison of map and observations, and for what counts."),
+            optional=True,
+        ),
+        explained(region, tr("Polygons, such as the footprints of the local maps; nothing outside counts.")),
+    ]
+
+
+def comparing_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return how an evaluation reads its layers, and what it works out."""
+    text = tr(
+        "region: what lies in the region above; observations: of the reference what lies within 2 m of an observation; "
+        "footprints: what lies in the footprints that come with the observations; all: everything. auto: the region "
+        "where there is one, else the observations, else all."
+    )
+    choices = (AUTOMATIC, "region", "observations", "footprints", "all")
+    return [
+        _field("CLASS_FIELD", tr("Class column"), tr("Only features of one class are compared."), layers="MERGED"),
+        text_parameter(
+            "CLASS_NAME",
+            tr("Class of features without one"),
+            tr("What the class of a feature is where no column names one."),
+            default="line",
+        ),
+        _field(
+            "SCORE_FIELD", tr("Score column"), tr("Confidence from 0 to 1, for average precision."), layers="MERGED"
+        ),
+        text_parameter(
+            "AREA",
+            tr("More area classes"),
+            tr("Classes that are areas even where they come as lines, with commas between, beside ped_crossing."),
+        ),
+        choice_parameter("REGION_FROM", tr("What counts"), text, choices),
+        switch_parameter(
+            "PCM",
+            tr("Partial curve mapping"),
+            tr("Work out this measure of the paper too; it takes up to a minute."),
+        ),
+        *crs_parameters(),
+    ]
 
 
 def option_arguments(

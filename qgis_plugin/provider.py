@@ -7,6 +7,7 @@ from qgis.core import QgsProcessingProvider
 from qgis.PyQt import sip
 from qgis.PyQt.QtGui import QIcon
 
+from .algorithms.evaluate_map import EvaluateMap
 from .algorithms.merge_local_maps import MergeLocalMaps
 from .algorithms.merge_network import MergeNetwork
 from .algorithms.project_local_maps import ProjectLocalMaps
@@ -59,7 +60,7 @@ class PolyMergeProvider(QgsProcessingProvider):
 
     def loadAlgorithms(self) -> None:
         """Add the algorithms."""
-        for algorithm in (SetUp, ProjectLocalMaps, MergeLocalMaps, MergeNetwork):
+        for algorithm in (SetUp, ProjectLocalMaps, MergeLocalMaps, MergeNetwork, EvaluateMap):
             self.addAlgorithm(algorithm())
 
     def style(self, name: str) -> Style:

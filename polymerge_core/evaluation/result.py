@@ -11,6 +11,7 @@ import pandas as pd
 #: Layers and table of a file of an evaluation.
 ERRORS_LAYER = "errors"
 EVALUATED_LAYER = "evaluated"
+EVALUATED_AREAS_LAYER = "evaluated_areas"
 MEASURES_TABLE = "measures"
 
 #: Columns of the table of measures.
@@ -86,5 +87,9 @@ class Evaluation:
         return str(wide.rename_axis(index=None, columns=None).to_string(float_format="%.3f", na_rep="-"))
 
     def layers(self) -> dict[str, pd.DataFrame]:
-        """Return what there is by layer name, ready for `polymerge_core.write_layers`."""
-        return {ERRORS_LAYER: self.errors, EVALUATED_LAYER: self.elements, MEASURES_TABLE: self.table}
+        """Return what there is by layer name, ready for `polymerge_core.write_layers`; lines and polygons apart."""
+        polygon = self.elements.geom_type == "Polygon"
+        layers = {ERRORS_LAYER: self.errors, EVALUATED_LAYER: self.elements}
+        if polygon.any() and not polygon.all():
+            layers |= {EVALUATED_LAYER: self.elements[~polygon], EVALUATED_AREAS_LAYER: self.elements[polygon]}
+        return layers | {MEASURES_TABLE: self.table}

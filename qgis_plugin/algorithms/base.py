@@ -106,6 +106,19 @@ class Staged(NamedTuple):
     shown_as: dict[str, str]
 
 
+class OtherFile(NamedTuple):
+    """A file that the worker writes beside its layers."""
+
+    parameter: str
+    title: str
+    #: The option of the command that names it.
+    option: str
+    #: Such as ``HTML (*.html)``, and the ending of it.
+    kinds: str
+    suffix: str
+    help: str
+
+
 class WorkerAlgorithm(PolyMergeAlgorithm):
     """An algorithm whose work is one command of the command line.
 
@@ -117,6 +130,8 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
     COMMAND = ""
     #: The parameters that are options of the command.
     OPTIONS: tuple[str, ...] = ()
+    #: The option that names the file of layers.
+    LAYERS_OPTION = "--output"
     #: Outputs that are numbers, with the text that describes them.
     NUMBERS: tuple[tuple[str, str], ...] = ()
 
@@ -126,6 +141,10 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
 
     def results(self) -> list[Result]:
         """Return the layers that come out."""
+        return []
+
+    def files(self) -> list[OtherFile]:
+        """Return the files that come out beside the layers and the report."""
         return []
 
     def places_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[Place]:
@@ -144,6 +163,7 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
                 )
         taken = [(place, tr("a file that is read")) for place in self.places_read(parameters, context)]
         outputs = {result.parameter: result.title for result in self.results()} | {"REPORT": tr("Report")}
+        outputs |= {each.parameter: each.title for each in self.files()}
         for name, title in outputs.items():
             place = place_of(parameters.get(name), context)
             if place is None:
@@ -197,6 +217,11 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
             self.addParameter(definition)
         for result in self.results():
             self.addParameter(result.definition())
+        for each in self.files():
+            file = QgsProcessingParameterFileDestination(
+                each.parameter, each.title, fileFilter=each.kinds, optional=True, createByDefault=False
+            )
+            self.addParameter(explained(file, each.help))
         report = QgsProcessingParameterFileDestination(
             "REPORT", tr("Report"), fileFilter="JSON (*.json)", optional=True, createByDefault=False
         )
@@ -223,23 +248,34 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
             staged = self.stage(parameters, context, folder, Part(feedback, 0.0, _STAGED))
             options = option_arguments(self.OPTIONS, self, parameters, context)
             output, report = folder / "result.gpkg", folder / "report.json"
-            arguments = [*options, *staged.options, f"--output={output}", f"--json={report}", "--", *staged.inputs]
+            copies = {"REPORT": report}
+            for each in self.files():
+                if self.parameterAsFileOutput(parameters, each.parameter, context):
+                    copies[each.parameter] = folder / f"file{each.suffix}"
+                    options.append(f"{each.option}={copies[each.parameter]}")
+            targets = [f"{self.LAYERS_OPTION}={output}", f"--json={report}"]
+            arguments = [*options, *staged.options, *targets, "--", *staged.inputs]
             shown_as = {**staged.shown_as, f" -> {output}": ""}
             run_worker(self.COMMAND, arguments, Part(feedback, _STAGED, _WORKED), shown_as=shown_as)
             found = json.loads(report.read_text(encoding="utf-8"))
             done: dict[str, Any] = dict(self.numbers(found))
             for result in self.results():
                 done.update(deliver(result, output, self, parameters, context, feedback))
-            copy_to = self.parameterAsFileOutput(parameters, "REPORT", context)
-            if copy_to:
-                try:
-                    shutil.copyfile(report, copy_to)
-                except OSError as error:
-                    message = tr("The report {} cannot be written: {}").format(copy_to, error.strerror)
-                    raise QgsProcessingException(message) from error
-                done["REPORT"] = copy_to
+            for name, file in copies.items():
+                copy_to = self.parameterAsFileOutput(parameters, name, context)
+                if copy_to:
+                    _copy_file(file, copy_to)
+                    done[name] = copy_to
         feedback.setProgress(100)
         return done
+
+
+def _copy_file(file: Path, copy_to: str) -> None:
+    try:
+        shutil.copyfile(file, copy_to)
+    except OSError as error:
+        message = tr("The report {} cannot be written: {}").format(copy_to, error.strerror)
+        raise QgsProcessingException(message) from error
 
 
 def _unacceptable(definition: QgsProcessingParameterDefinition, value: Any) -> str:

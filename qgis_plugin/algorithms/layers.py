@@ -59,7 +59,7 @@ class LayerAlgorithm(WorkerAlgorithm):
         super().prepareAlgorithm(parameters, context, feedback)
         selected = self.parameterAsBoolean(parameters, "SELECTED_ONLY", context)
         layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
-        for warning in filter(None, map(_passed_over, layers)):
+        for warning in filter(None, map(passed_over, layers)):
             feedback.pushWarning(warning)
         self._layers = layer_inputs(layers, selected_only=selected)
         for name, part in _MAIN_MAP.items():
@@ -124,11 +124,8 @@ class LayerAlgorithm(WorkerAlgorithm):
         if not parameters.get("MAIN_MAP") and any(parameters.get(name) for name in _MAIN_MAP):
             return tr("Areas or retired ids of a main map are given, but no main map: choose it too.")
         declared = self.parameterAsCrs(parameters, "CRS", context).isValid()
-        if declared and self.parameterAsBoolean(parameters, "LOCAL_CRS", context):
-            return tr(
-                "Layers without a CRS cannot be both in a CRS and in plain metres: give CRS or LOCAL_CRS, not both."
-            )
-        return ""
+        plain = self.parameterAsBoolean(parameters, "LOCAL_CRS", context)
+        return crs_contradiction(declared=declared, plain=plain)
 
     def _unfit(self, parameters: Parameters, context: QgsProcessingContext) -> str:
         layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
@@ -136,13 +133,20 @@ class LayerAlgorithm(WorkerAlgorithm):
         declared = self.parameterAsCrs(parameters, "CRS", context).isValid()
         plain = self.parameterAsBoolean(parameters, "LOCAL_CRS", context)
         faults = (
-            _layer_fault(layer, has_crs=is_known(crs_of(layer)) or declared or plain)
+            layer_fault(layer, has_crs=is_known(crs_of(layer)) or declared or plain)
             for layer in [*layers, *([] if main_map is None else [main_map])]
         )
         return next(filter(None, faults), "")
 
 
-def _passed_over(layer: QgsVectorLayer) -> str:
+def crs_contradiction(*, declared: bool, plain: bool) -> str:
+    """Say that layers without a CRS cannot be in a CRS and in none; empty where they are not."""
+    if not (declared and plain):
+        return ""
+    return tr("Layers without a CRS cannot be both in a CRS and in plain metres: give CRS or LOCAL_CRS, not both.")
+
+
+def passed_over(layer: QgsVectorLayer) -> str:
     """Say which layer of a file is taken where none was named, as QGIS does without a word; empty where it is plain."""
     if layer.providerType() != "ogr" or "|" in layer.source():
         return ""
@@ -157,7 +161,8 @@ def _passed_over(layer: QgsVectorLayer) -> str:
     ).format(Path(layer.source()).name, spatial[0], Path(layer.source()).name)
 
 
-def _layer_fault(layer: QgsVectorLayer, *, has_crs: bool) -> str:
+def layer_fault(layer: QgsVectorLayer, *, has_crs: bool) -> str:
+    """Say what is wrong with a layer, as far as QGIS can know; empty where nothing is."""
     kind = layer.geometryType()
     if kind == QgsWkbTypes.GeometryType.PointGeometry:
         return tr("Layer “{}” holds points: choose layers of lines or polygons.").format(layer.name())

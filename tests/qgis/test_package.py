@@ -16,6 +16,7 @@ import pytest
 
 import polymerge_core
 from polymerge_core import schema
+from polymerge_core.evaluation.result import MEASURE_COLUMNS
 from polymerge_core.figures import _COLOURS
 from qgis_plugin import package
 
@@ -32,6 +33,10 @@ LARGEST_UPLOAD = 25_000_000
 #: The columns of the merged map, and what three of them are called in a Shapefile.
 ELEMENTS = {*schema.ELEMENT_COLUMNS, "elem_id", "n_obs", "n_inst"}
 
+#: The columns of evaluated elements.
+EVALUATED = {"element_id", "class", "score", "length_m", "reference_id", "frechet_m", "iou", "beyond_share"}
+EVALUATED |= {"lateral_median_m", "lateral_p95_m"}
+
 COLUMNS = {
     "local_maps": {"class", "drive", "instance", "score", "timestamp"},
     "instances": {"drive", "instance", "timestamp_ns", "x", "y", "heading", "n_observations"},
@@ -42,6 +47,10 @@ COLUMNS = {
     "lineage": set(schema.LINEAGE_COLUMNS),
     "left_out": set(schema.LEFT_OUT_COLUMNS),
     "id_aliases": set(schema.ALIAS_COLUMNS),
+    "evaluation_errors": {"element_id", "class", "error_m", "beyond"},
+    "evaluated": EVALUATED,
+    "evaluated_areas": EVALUATED,
+    "measures": set(MEASURE_COLUMNS),
 }
 
 
@@ -281,7 +290,7 @@ def test_requirements_are_the_dependencies_of_the_package():
 
 class TestIcons:
     def test_there_is_one_for_the_plugin_and_each_algorithm(self):
-        assert [path.stem for path in ICONS] == ["merge", "network", "polymerge", "project", "setup"]
+        assert [path.stem for path in ICONS] == ["evaluate", "merge", "network", "polymerge", "project", "setup"]
 
     @pytest.mark.parametrize("path", ICONS, ids=lambda path: path.stem)
     def test_is_a_small_plain_drawing(self, path):

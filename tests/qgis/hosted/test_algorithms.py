@@ -30,9 +30,9 @@ from qgis_plugin.layout import ROOT, metadata, style_path
 
 from .layers import EAST, NORTH, file_layer, memory_layer, track
 
-IDS = ("setup", "projectlocalmaps", "mergelocalmaps", "mergenetwork")
+IDS = ("setup", "projectlocalmaps", "mergelocalmaps", "mergenetwork", "evaluatemap")
 WORKERS = IDS[1:]
-MERGERS = IDS[2:]
+MERGERS = IDS[2:4]
 
 pytestmark = pytest.mark.usefixtures("provider")
 
@@ -133,11 +133,13 @@ class TestEvery:
         plain = {each.name() for each in algorithm(name).parameterDefinitions() if not each.flags() & advanced}
         layers = {"LOCAL_MAPS", "SELECTED_ONLY", "PROXIMITY", "MAIN_MAP", "CLASS_FIELD", "OUTPUT"}
         files = {"PREDICTIONS", "POSES", "LIDAR_TO_EGO"}
+        compared = {"MERGED", "REFERENCE", "LOCAL_MAPS", "REGION", "CLASS_FIELD"}
         wanted = {
             "setup": {"PYTHON", "USE_AS_IS", "WHEELS", "CHECK_ONLY"},
             "projectlocalmaps": files | {"CRS", "POSE_KIND", "OUTPUT", "INSTANCES", "LEFT_OUT"},
             "mergelocalmaps": layers | {"AREAS", "LINEAGE", "LEFT_OUT", "ID_ALIASES"},
             "mergenetwork": layers | {"EDGES"},
+            "evaluatemap": compared | {"OUTPUT", "EVALUATED", "EVALUATED_AREAS", "MEASURES", "PAGE"},
         }
         assert plain == wanted[name]
 
@@ -149,6 +151,7 @@ class TestOutputs:
             ("projectlocalmaps", {"N_OBSERVATIONS", "N_INSTANCES", "N_LEFT_OUT"}),
             ("mergelocalmaps", {"N_ELEMENTS", "N_OBSERVATIONS", "N_LEFT_OUT"}),
             ("mergenetwork", {"N_COMPONENTS", "N_OBSERVATIONS", "LARGEST_COMPONENT"}),
+            ("evaluatemap", {"AVERAGE_PRECISION", "N_ELEMENTS", "N_REFERENCE"}),
         ],
     )
     def test_numbers_are_there_for_models(self, name, numbers):

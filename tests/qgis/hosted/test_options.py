@@ -18,11 +18,21 @@ from qgis.core import (
 from qgis_plugin.layout import ROOT
 from qgis_plugin.parameters import AUTOMATIC, REPEATED, crs_text, is_known, option_arguments
 
-COMMANDS = {"mergelocalmaps": "merge", "mergenetwork": "network", "projectlocalmaps": "project"}
+COMMANDS = {
+    "mergelocalmaps": "merge",
+    "mergenetwork": "network",
+    "projectlocalmaps": "project",
+    "evaluatemap": "evaluate",
+}
+
+#: Options that name files, which are checked or made before the command line is asked.
+FILES = frozenset({"MAIN_MAP", "POSES", "REFERENCE", "REGION"})
 
 #: What is of one side only, and why.
 ONLY_IN_QGIS = {
-    "LOCAL_MAPS": "the inputs",
+    "LOCAL_MAPS": "the inputs; of an evaluation --local",
+    "MERGED": "the input",
+    "PAGE": "--output",
     "PREDICTIONS": "the input",
     "SELECTED_ONLY": "files have no selection",
     "MAIN_MAP_AREAS": "a part of --main-map",
@@ -32,6 +42,8 @@ ONLY_IN_QGIS = {
 }
 ONLY_IN_THE_COMMAND_LINE = {
     "OUTPUT": "a file; a sink in QGIS",
+    "LAYERS": "a file; sinks in QGIS",
+    "LOCAL": "LOCAL_MAPS",
     "OVERWRITE": "the file is always new",
     "JSON": "REPORT",
     "PROGRESS": "always json",
@@ -100,8 +112,7 @@ class TestTheSame:
 
     @every
     def test_each_reaches_the_command_line(self, name):
-        files = {"MAIN_MAP", "POSES"}  # staged, or checked, before
-        assert set(algorithm(name).OPTIONS) == set(parameters_of(name)) - set(ONLY_IN_QGIS) - files
+        assert set(algorithm(name).OPTIONS) == set(parameters_of(name)) - set(ONLY_IN_QGIS) - FILES
 
     def test_the_lists_of_what_differs_name_nothing_that_is_gone(self, options):
         in_qgis = {each for name in COMMANDS for each in parameters_of(name)}
@@ -141,6 +152,7 @@ class TestTheSame:
     @every
     def test_repeated_options(self, options, name):
         theirs = {each for each, it in options(name).items() if it["repeated"]}
+        theirs -= {*FILES, *ONLY_IN_THE_COMMAND_LINE}
         assert theirs == REPEATED & set(parameters_of(name))
 
     @every
@@ -165,12 +177,13 @@ class TestTheSame:
         calls = []
         for name, command in COMMANDS.items():
             options = option_arguments(algorithm(name).OPTIONS, algorithm(name), {"CRS": "EPSG:32632"}, context)
-            files = ["--poses=/nowhere.csv"] if command == "project" else []
-            calls.append([command, *options, *files, "--output=/nowhere.gpkg", "--", "/nowhere.json"])
+            files = {"project": ["--poses=/nowhere.csv"], "evaluate": ["--reference=/truth.gpkg"]}.get(command, [])
+            target = f"{algorithm(name).LAYERS_OPTION}=/nowhere.gpkg"
+            calls.append([command, *options, *files, target, "--", "/nowhere.json"])
         asked = [interpreter, "-c", code, json.dumps(calls)]
         done = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=True)
-        assert json.loads(done.stdout) == [1, 1, 1], done.stderr  # 1: the file is not there; 2: an option is wrong
-        assert done.stderr.count("/nowhere.json") == 3
+        assert json.loads(done.stdout) == [1, 1, 1, 1], done.stderr  # 1: the file is not there; 2: an option is wrong
+        assert done.stderr.count("/nowhere.json") == 4
 
 
 def arguments(context, names, name="mergelocalmaps", **given):

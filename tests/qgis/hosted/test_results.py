@@ -361,12 +361,24 @@ class TestStyle:
 
     @pytest.mark.parametrize(
         "style",
-        ["local_maps", "merged_areas", "instances", "network_edges", "network_observations", "left_out", "id_aliases"],
+        [
+            "local_maps",
+            "merged_areas",
+            "instances",
+            "network_edges",
+            "network_observations",
+            "left_out",
+            "id_aliases",
+            "evaluation_errors",
+            "evaluated",
+            "evaluated_areas",
+            "measures",
+        ],
     )
     def test_loads_without_a_word(self, feedback, style):
-        kind = {"merged_areas": "Polygon", "instances": "Polygon", "left_out": "None", "id_aliases": "None"}.get(
-            style, "LineString"
-        )
+        areas = dict.fromkeys(("merged_areas", "instances", "evaluated_areas"), "Polygon")
+        tables = dict.fromkeys(("left_out", "id_aliases", "measures"), "None")
+        kind = (areas | tables).get(style, "LineString")
         given = memory_layer([], kind=kind, columns="field=class:string&field=component:integer")
         Style(style).postProcessLayer(given, None, feedback)
         assert feedback.everything == []

@@ -247,6 +247,61 @@ class TestNetwork:
             assert (layer.featureCount(), layer.wkbType()) == (0, QgsWkbTypes.Type.LineString)
 
 
+class TestEvaluation:
+    def test_shows_the_error_along_the_map(self, run, context, tmp_path):
+        merged, reference = memory_layer([track(0.5), track(90)]), memory_layer([track()])
+        page = tmp_path / "page.html"
+        wanted = dict.fromkeys(("OUTPUT", "EVALUATED", "MEASURES"), "memory:")
+        results = run("evaluatemap", MERGED=[merged], REFERENCE=[reference], PAGE=str(page), **wanted)
+        assert (results["N_ELEMENTS"], results["N_REFERENCE"]) == (2, 1)
+        assert 0 < results["AVERAGE_PRECISION"] <= 1
+        errors = table(opened(results, "OUTPUT", context))
+        near = [row["error_m"] for row in errors if not row["beyond"]]
+        assert near
+        assert max(near) < 1.5
+        assert any(row["beyond"] for row in errors)
+        assert len(table(opened(results, "EVALUATED", context))) == 2
+        measures = {row["measure"]: row["value"] for row in table(opened(results, "MEASURES", context))}
+        assert measures["recall_1.0"] == pytest.approx(1)
+        assert page.read_text(encoding="utf-8").startswith("<!doctype html>")
+        assert results["PAGE"] == str(page)
+
+    def test_counts_what_lies_in_the_region_only(self, run, context):
+        merged, reference = memory_layer([track(0.5), track(90)]), memory_layer([track()])
+        box = f"POLYGON(({EAST - 9} {NORTH - 9}, {EAST + 999} {NORTH - 9}, {EAST + 999} {NORTH + 40}, "
+        region = memory_layer([box + f"{EAST - 9} {NORTH + 40}, {EAST - 9} {NORTH - 9}))"], kind="Polygon")
+        results = run("evaluatemap", MERGED=[merged], REFERENCE=[reference], REGION=region, OUTPUT="memory:")
+        assert not any(row["beyond"] for row in table(opened(results, "OUTPUT", context)))
+
+    def test_of_observations_is_compared_with_them(self, run, context):
+        roles = {"MERGED": 0.2, "REFERENCE": 0.0, "LOCAL_MAPS": 0.6}
+        given = {role: [memory_layer([track(shift)])] for role, shift in roles.items()}
+        results = run("evaluatemap", **given, OUTPUT="memory:", MEASURES="memory:")
+        measures = {row["measure"]: row["value"] for row in table(opened(results, "MEASURES", context))}
+        assert measures["frechet_after"] < measures["frechet_before"]
+
+    def test_of_areas_puts_them_apart(self, run, context):
+        square = "POLYGON(({0} {1}, {2} {1}, {2} {3}, {0} {3}, {0} {1}))".format(EAST, NORTH, EAST + 9, NORTH + 9)
+        area = memory_layer([square], kind="Polygon")
+        results = run("evaluatemap", MERGED=[area], REFERENCE=[area], OUTPUT="memory:", EVALUATED_AREAS="memory:")
+        (row,) = table(opened(results, "EVALUATED_AREAS", context))
+        assert row["iou"] == pytest.approx(1)
+
+    @pytest.mark.parametrize(
+        ("given", "words"),
+        [
+            ({"REFERENCE": lambda: [memory_layer([], kind="Point")]}, "holds points"),
+            ({"REFERENCE": lambda: [memory_layer([])]}, "reference holds no line or polygon"),
+            ({"REGION_FROM": lambda: "region"}, "region"),
+        ],
+        ids=["points", "an empty reference", "no region"],
+    )
+    def test_of_what_cannot_be_compared_is_a_sentence(self, run, given, words):
+        layers = {"MERGED": [memory_layer([track()])], "REFERENCE": [memory_layer([track()])]}
+        with pytest.raises(QgsProcessingException, match=words):
+            run("evaluatemap", **{**layers, **{name: make() for name, make in given.items()}}, OUTPUT="memory:")
+
+
 FILES = {"PREDICTIONS": str(SAMPLE / "predictions.json"), "POSES": str(SAMPLE / "poses.csv")}
 
 

@@ -153,6 +153,31 @@ def test_the_network_of_the_sample_is_that_of_the_command_line(qgis: Qgis, sampl
     assert done["N_COMPONENTS"] == table(done["OUTPUT"])["component"].nunique()
 
 
+def test_an_evaluation_of_the_sample_is_that_of_the_command_line(
+    qgis: Qgis, sample_folder: Path, tmp_path: Path
+) -> None:
+    local, merged, expected = (tmp_path / f"{name}.gpkg" for name in ("local_maps", "merged", "expected"))
+    predictions, poses = sample_folder / "predictions.json", sample_folder / "poses.csv"
+    reference = f"{sample_folder / 'reference.gpkg'}|layername=ground_truth"
+    command_line("project", predictions, "--poses", poses, "--crs", UTM, "-o", local)
+    command_line("merge", local, "-o", merged)
+    # QGIS hands layers over one by one, so that it has no footprints beside the observations.
+    seen = tmp_path / "seen.gpkg"
+    table(local, "local_maps").to_file(seen, layer="local_maps")
+    command_line("evaluate", merged, "--reference", reference, "--local", seen, "--layers", expected)
+    outputs = {name: tmp_path / f"{name}.gpkg" for name in ("OUTPUT", "EVALUATED", "MEASURES")}
+    layers = {"MERGED": f"{merged}|layername=elements", "REFERENCE": reference}
+    layers["LOCAL_MAPS"] = f"{seen}|layername=local_maps"
+
+    done = qgis.run("polymerge:evaluatemap", {**layers, **outputs, "PAGE": tmp_path / "page.html"}).results
+
+    assert_same(done["OUTPUT"], expected, "errors")
+    assert_same(done["EVALUATED"], expected, "evaluated")
+    assert_same(done["MEASURES"], expected, "measures")
+    assert (done["N_ELEMENTS"], done["N_REFERENCE"]) == (16, len(table(sample_folder / "reference.gpkg")))
+    assert "<h2>divider</h2>" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
 @pytest.fixture(scope="module")
 def two_systems(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """One road in metres and in degrees."""

@@ -9,6 +9,7 @@ from tests.qgis.process.running import Qgis
 ALGORITHMS = {
     "mergelocalmaps": "Merge local maps",
     "mergenetwork": "Merge network",
+    "evaluatemap": "Evaluate map",
     "projectlocalmaps": "Project local maps",
     "setup": "Set up PolyMerge",
 }
