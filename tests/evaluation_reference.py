@@ -210,25 +210,25 @@ def lateral(merged, references):
 def duplication(merged, references):
     """Merged length that lies alongside the reference, over the reference length that it projects onto.
 
-    A piece lies alongside where both its ends are near one and the same line, not beyond an end of it, and not at
-    two places of it that are much farther apart than the piece is long.
+    A step from the middle of one piece to that of the next lies alongside where both are near one and the same line,
+    not beyond an end of it, and not at two places of it that are much farther apart than the step is long.
     """
     near = 0.0
     covered: dict[int, list[tuple[float, float]]] = {}
-    for piece in (piece for line in merged for piece in pieces(line)):
-        (far, number), (other_far, other) = nearest(piece.start, references), nearest(piece.end, references)
+    for here, there in (pair for line in merged for pair in itertools.pairwise(pieces(line))):
+        (far, number), (other_far, other) = nearest(here.middle, references), nearest(there.middle, references)
         if max(far, other_far) > NEAR_M or number != other:
             continue
         reference = references[number]
-        low, high = sorted((project(piece.start, reference)[1], project(piece.end, reference)[1]))
+        low, high = sorted((project(here.middle, reference)[1], project(there.middle, reference)[1]))
         if is_closed(reference) and high - low > length(reference) / 2:
-            near += piece.length
+            near += here.length
             covered.setdefault(number, []).extend([(0.0, low), (high, length(reference))])
             continue
         is_beyond = not is_closed(reference) and low == high and low in (0.0, length(reference))
-        if is_beyond or high - low > 4 * piece.length:
+        if is_beyond or high - low > 4 * here.length:
             continue
-        near += piece.length
+        near += here.length
         covered.setdefault(number, []).append((low, high))
     return near / sum(union_length(intervals) for intervals in covered.values())
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 #: Cells of one antidiagonal that are worked on at once: what the processor keeps at hand.
-_CELLS = 16_000
+_CELLS = 64_000
 
 #: A section shorter than this (metres) is a point, and has no direction to turn by.
 _POINT_M = 1e-9

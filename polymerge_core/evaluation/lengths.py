@@ -92,26 +92,24 @@ def lateral_measures(merged: Followed) -> list[Measure]:
     ]
 
 
-def duplication(merged: Followed, reference: Curves, others: NearestLine) -> Measure:
+def duplication(merged: Followed, reference: Curves) -> Measure:
     """Return the merged length over the reference length that it covers perpendicularly: 1 is right, 2 is doubled."""
-    curves = merged.curves
     if len(reference) == 0:
         return ratio("duplication", NONE, 0.0, 0.0, 0)
-    every = np.arange(len(curves))
-    ends, owner = curves.resampled(every, np.zeros(len(curves)), curves.length, STEP_M)
-    foot = others(ends)
-    first = np.flatnonzero(owner[:-1] == owner[1:])
-    # Piece by piece: both ends must fall on one line, and not beyond its end.
+    # From middle to middle: both must fall on one line, and not beyond its end.
+    foot, pieces = merged.nearest, merged.pieces
+    first = np.flatnonzero(pieces.line[:-1] == pieces.line[1:])
+    length_m = pieces.length[first]
     line, start, stop = foot.line[first], foot.position[first], foot.position[first + 1]
-    same = (line >= 0) & (line == foot.line[first + 1]) & merged.counts
+    same = (line >= 0) & (line == foot.line[first + 1]) & merged.counts[first] & merged.counts[first + 1]
     # On a ring the shorter way counts, which may lead over its start.
     around, length = reference.closed[line], reference.length[line]
     stop = np.where(around, start + (stop - start + length / 2) % length - length / 2, stop)
     still = np.abs(stop - start) <= _ROUNDING_M
     at_end = (start <= _ROUNDING_M) | (start >= length - _ROUNDING_M)
-    used = same & ~(~around & still & at_end) & (np.abs(stop - start) <= _LEAP * merged.pieces.length)
+    used = same & ~(~around & still & at_end) & (np.abs(stop - start) <= _LEAP * length_m)
     covered = _union(reference, line[used], np.minimum(start, stop)[used], np.maximum(start, stop)[used])
-    return ratio("duplication", NONE, float(merged.pieces.length[used].sum()), covered, int(used.sum()))
+    return ratio("duplication", NONE, float(length_m[used].sum()), covered, int(used.sum()))
 
 
 def _union(curves: Curves, line: Index, low: Array, high: Array) -> float:

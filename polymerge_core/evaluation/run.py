@@ -171,7 +171,7 @@ def _judge(maps: Maps, name: str, chosen: str) -> _Judged:
     rest += _detection_part(followed, drawn, score, truth_followed)
     rest += lengths.coverage_measures(followed, truth_followed)
     rest += [
-        lengths.duplication(followed, reference, to_reference),
+        lengths.duplication(followed, reference),
         lengths.fragments(followed),
         lengths.zigzag("zigzag", followed, of_merged),
         lengths.zigzag("zigzag_reference", truth_followed, of_reference),

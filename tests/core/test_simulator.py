@@ -14,7 +14,7 @@ import shapely
 from geopandas.testing import assert_geodataframe_equal
 
 from benchmarks.make_sample import make_sample
-from benchmarks.noise import CLASS_NAMES, Noise, unit_noise
+from benchmarks.noise import CLASS_NAMES, CrossingNoise, LineNoise, Noise, unit_noise
 from benchmarks.simulate_drive import main
 from benchmarks.simulator import key_frames, simulate
 from benchmarks.town import town_drive, town_truth
@@ -411,3 +411,24 @@ def test_command_line_says_what_is_wrong_in_one_line(tmp_path, town, capsys):
     assert "no column qw" in message
     assert message.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_the_noise_model_is_frozen():
+    # Figures in the documentation rest on these numbers; a change of the method must not be bought by a change of them.
+    assert Noise() == Noise(
+        pose_m=0.15,
+        pose_deg=0.5,
+        divider=LineNoise(0.107, 0.0065, 1.0),
+        boundary=LineNoise(0.42, 0.040, 2.2),
+        crossing=CrossingNoise(base_m=0.20, slope=0.008, scale=0.06, turn_deg=2.0, corner_m=0.15),
+        correlation_m=12.0,
+        along=0.5,
+        missed=0.20,
+        split=0.10,
+        reverse=0.5,
+        false=0.08,
+        score_true=(12.0, 2.0),
+        score_false=(4.0, 3.0),
+        pose_drive_share=0.0,
+        shape_drive_share=0.0,
+    )
