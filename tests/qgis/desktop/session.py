@@ -42,6 +42,7 @@ DATA, PICTURES = Path(ORDERS["data"]), Path(ORDERS["pictures"])
 RECORD = Record(Path(ORDERS["record"]))
 
 ALGORITHMS = {
+    "polymerge:evaluatemap": "Evaluate map",
     "polymerge:mergelocalmaps": "Merge local maps",
     "polymerge:mergenetwork": "Merge network",
     "polymerge:projectlocalmaps": "Project local maps",
@@ -93,7 +94,7 @@ def show_toolbox() -> None:
     names = {index: tree.algorithmForIndex(index) for index in _indexes()}
     own = {index: each for index, each in names.items() if each is not None and each.provider().id() == "polymerge"}
     found = {each.id(): each.displayName() for each in own.values()}
-    RECORD.check("the toolbox has the four algorithms", found == ALGORITHMS, found)
+    RECORD.check("the toolbox has the five algorithms", found == ALGORITHMS, found)
     tree.collapseAll()
     for index in own:
         tree.expand(index.parent())
