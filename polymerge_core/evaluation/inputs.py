@@ -135,8 +135,9 @@ def _find(names: Sequence[Any], chosen: str | None, default: str, where: str) ->
 
 def _check_class_field(layers: Sequence[LocalMaps], options: Options) -> None:
     """Refuse a class column that a layer lacks: its lines would be compared with nothing."""
-    without = [maps for maps in layers if "class" not in maps.observations and len(maps.observations)]
-    if not without or (options.class_field is None and len(without) == len(layers)):
+    filled = [maps for maps in layers if len(maps.observations)]
+    without = [maps for maps in filled if "class" not in maps.observations]
+    if not without or (options.class_field is None and len(without) == len(filled)):
         return
     wanted = options.class_field or "class"
     raise SchemaError(

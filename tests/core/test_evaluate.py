@@ -467,6 +467,11 @@ def test_an_empty_reference_is_refused_in_one_sentence(empty):
         pm.evaluate(moved(layer(level(0))), empty)
 
 
+def test_an_empty_layer_needs_no_class_column():
+    with pytest.raises(pm.InputError, match="reference holds no line"):
+        judge(layer(level(0)).drop(columns="class"), layer(level(0)).drop(columns="class").iloc[:0])
+
+
 def test_degrees_are_measured_in_metres():
     merged, reference = moved(layer(level(0.5, 10, 90))), moved(layer(level(0)))
     result = pm.evaluate(merged.to_crs(DEGREES), reference.to_crs(DEGREES))
