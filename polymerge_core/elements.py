@@ -19,7 +19,11 @@ from polymerge_core.sets import ElementSets
 
 
 def build_elements(
-    observations: Observations, sets: ElementSets, shapes: NDArray[np.object_], options: Options
+    observations: Observations,
+    sets: ElementSets,
+    shapes: NDArray[np.object_],
+    options: Options,
+    known: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> tuple[gpd.GeoDataFrame, NDArray[np.int64], pd.DataFrame]:
     """Turn merged shapes into the layer `elements`.
 
@@ -33,6 +37,8 @@ def build_elements(
         The merged shape of each component, in the working CRS; areas as polygons.
     options : Options
         How the user's columns are carried.
+    known : mapping of str to ndarray, optional
+        Columns of the elements that the method knows better, or more of.
 
     Returns
     -------
@@ -54,6 +60,7 @@ def build_elements(
         "n_observations": total.astype(np.int64),
         "n_instances": _count_instances(table, component, len(base)),
         "length_m": shapely.length(shapes),
+        **(known or {}),
     }
     attributes = _carry_columns(observations.attributes, component, base, options.aggregate)
     geometry = _output_geometry(observations, component, base, shapes)

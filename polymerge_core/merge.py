@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from polymerge_core.area import merge_areas
 from polymerge_core.batch import PolylineSets, merge_sets
+from polymerge_core.consensus import describe_corrections, merge_by_consensus
 from polymerge_core.crs import crs_name
 from polymerge_core.elements import build_elements, build_lineage
-from polymerge_core.observations import Observations
+from polymerge_core.observations import Observations, observe
 from polymerge_core.options import Options
 from polymerge_core.schema import (
     ALIASES_TABLE,
@@ -32,7 +33,7 @@ from polymerge_core.schema import (
     LINEAGE_TABLE,
     LocalMaps,
 )
-from polymerge_core.sets import ElementSets, Input, Progress, find_network, order_sets
+from polymerge_core.sets import ElementSets, Input, Progress, as_local_maps, find_network, order_sets
 
 
 @dataclass(frozen=True)
@@ -127,8 +128,8 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
         Observations under it are left out (the paper uses 0.8).
     timestamp_field : str, optional
         Column that orders the instances, `timestamp` by default: dates with times, or integer nanoseconds.
-    method : {"polymerge"}, default "polymerge"
-        How a set of observations becomes one element: "polymerge" as published.
+    method : {"polymerge", "consensus"}, default "polymerge"
+        How observations become elements: "polymerge" as published, "consensus" one smooth line from all looks at it.
     proximity : float, default 1.0
         Th_prox, metres: polylines with a vertex nearer than this to each other are merged.
     coverage : float, default 0.5
@@ -192,15 +193,37 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
         strict=strict,
     )
     report_progress = progress or (lambda _fraction, _message: None)
+    if options.method == "consensus":
+        return _merge_by_consensus(local_maps, main_map, options, report_progress)
     network = find_network(local_maps, main_map, options, report_progress, distances=False)
     sets = order_sets(network)
     shapes, lowered = _merge_shapes(network.observations, sets, options, report_progress)
     report_progress(0.95, "writing the tables")
     elements, ids, aliases = build_elements(network.observations, sets, shapes, options)
     lineage = build_lineage(network.observations, sets, ids)
-    report = _report(network.observations, sets, elements, options, lowered=lowered)
+    report = _report(network.observations, network.observations, sets, elements, options)
+    report = _with_areas(report, network.observations, sets, options, lowered=lowered)
     report_progress(1.0, "merged")
     return MergeResult(elements, lineage, network.observations.left_out, aliases, report)
+
+
+def _merge_by_consensus(local_maps: Input, main_map: Input | None, options: Options, progress: Progress) -> MergeResult:
+    """Merge by consensus: one line from all looks at it."""
+    progress(0.0, "reading the layers")
+    main: list[LocalMaps] = [] if main_map is None else as_local_maps(main_map, "main_map")
+    layers = as_local_maps(local_maps, "local_maps")
+    observations = observe(layers, main, options)
+    merged = merge_by_consensus(
+        observations, layers, options, lambda share: progress(0.1 + 0.85 * share, "finding the consensus")
+    )
+    progress(0.95, "writing the tables")
+    pieces, sets = merged.observations, merged.sets
+    elements, ids, aliases = build_elements(pieces, sets, merged.shapes, options, merged.columns)
+    lineage = build_lineage(pieces, sets, ids)
+    report = _report(observations, pieces, sets, elements, options)
+    report["corrections"] = describe_corrections(merged.corrections)
+    progress(1.0, "merged")
+    return MergeResult(elements, lineage, pieces.left_out, aliases, report)
 
 
 def _merge_shapes(
@@ -254,24 +277,11 @@ def _merge_lines(
     return cleaned
 
 
-def _report(
-    observations: Observations, sets: ElementSets, elements: gpd.GeoDataFrame, options: Options, *, lowered: int
+def _with_areas(
+    report: dict[str, Any], observations: Observations, sets: ElementSets, options: Options, *, lowered: int
 ) -> dict[str, Any]:
-    table, left_out = observations.table, observations.left_out
-    local = table[~table["is_main"]]
-    made = elements.groupby("class")["length_m"].agg(elements="size", elements_m="sum")
-    seen = local.groupby("class")["length_m"].agg(observations="size", observed_m="sum")
-    by_class = made.join(seen).fillna(0)
-    classes = {
-        str(row.Index): {
-            "observations": int(row.observations),
-            "observed_m": round(float(row.observed_m), 3),
-            "elements": int(row.elements),
-            "elements_m": round(float(row.elements_m), 3),
-        }
-        for row in by_class.itertuples()
-    }
-    warnings = list(observations.notes["warnings"])
+    """Say in the report what the published method does to areas."""
+    table, warnings = observations.table, report["warnings"]
     several = np.diff(sets.bounds) > 1
     kinds = table.loc[sets.base[several], ["is_area", "class"]]
     drawn = kinds.loc[kinds["is_area"] & ~kinds["class"].isin(AREA_CLASSES), "class"]
@@ -285,6 +295,30 @@ def _report(
             f"{lowered} areas have no place that {options.coverage:.0%} of their observations cover; "
             "their highest coverage was used instead"
         )
+    return report | {"areas_with_lowered_coverage": lowered}
+
+
+def _report(
+    observations: Observations,
+    pieces: Observations,
+    sets: ElementSets,
+    elements: gpd.GeoDataFrame,
+    options: Options,
+) -> dict[str, Any]:
+    table, left_out = observations.table, pieces.left_out
+    local = table[~table["is_main"]]
+    made = elements.groupby("class")["length_m"].agg(elements="size", elements_m="sum")
+    seen = local.groupby("class")["length_m"].agg(observations="size", observed_m="sum")
+    by_class = made.join(seen).fillna(0)
+    classes = {
+        str(row.Index): {
+            "observations": int(row.observations),
+            "observed_m": round(float(row.observed_m), 3),
+            "elements": int(row.elements),
+            "elements_m": round(float(row.elements_m), 3),
+        }
+        for row in by_class.itertuples()
+    }
     sizes = np.diff(sets.bounds)
     return {
         "method": options.method,
@@ -302,7 +336,6 @@ def _report(
         "largest_set": int(sizes.max()) if len(sizes) else 0,
         "left_out": {str(reason): int(count) for reason, count in left_out["reason"].value_counts(sort=False).items()},
         "cleaned_vertices": observations.notes["cleaned_vertices"],
-        "areas_with_lowered_coverage": lowered,
         "classes": classes,
-        "warnings": warnings,
+        "warnings": list(observations.notes["warnings"]),
     }

@@ -15,7 +15,7 @@ from typing import Any
 from polymerge_core.errors import OptionError
 from polymerge_core.schema import AREA_CLASSES
 
-METHODS = ("polymerge",)
+METHODS = ("polymerge", "consensus")
 INSTANCE_FROM = ("column", "layer", "feature")
 AGGREGATES = ("first", "mode", "mean", "min", "max", "sum")
 

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from polymerge_core.evaluation.curves import Array, Curves, turning
+from polymerge_core.curves import Array, Curves, turning
 from polymerge_core.evaluation.measures import METRES, NONE, Measure, mean_of
 
 #: A vertex where a ring turns by less than this is no corner, radians.

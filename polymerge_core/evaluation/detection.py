@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from polymerge_core.evaluation.curves import Array, Curves, Index, count_up
+from polymerge_core.curves import Array, Curves, Index, count_up
 from polymerge_core.evaluation.lengths import Followed
 from polymerge_core.evaluation.measures import METRES, NONE, Measure, mean_of
 

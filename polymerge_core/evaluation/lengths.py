@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from polymerge_core.evaluation.curves import Array, Curves, Index, Pieces, turning
+from polymerge_core.curves import Array, Curves, Index, Pieces, turning
 from polymerge_core.evaluation.measures import METRES, NONE, RADIANS_PER_METRE, SHARE, Measure, mean_of, ratio
 from polymerge_core.evaluation.nearest import Nearest, NearestLine
 from polymerge_core.evaluation.region import Counts

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from polymerge_core.evaluation.curves import Curves
+from polymerge_core.curves import Curves
 from polymerge_core.evaluation.frechet import partial_curve_mapping, raw_partial_curve_mapping
 from polymerge_core.evaluation.matching import STEP_M, Sections
 from polymerge_core.evaluation.measures import NONE, Measure, mean_of

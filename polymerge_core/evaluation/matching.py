@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from polymerge_core.evaluation.curves import Array, Curves, Index, count_up
+from polymerge_core.curves import Array, Curves, Index, count_up
 from polymerge_core.evaluation.frechet import frechet_of_flat
 from polymerge_core.network import check_pairs
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from polymerge_core.evaluation.curves import Array, Curves, Index, count_up
+from polymerge_core.curves import Array, Curves, Index, count_up
 
 #: Segments are cut so that none is longer than this, metres: a piece's middle then tells where the piece is.
 _PIECE_M = 2.0

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from polymerge_core.evaluation.curves import Array, Curves
+from polymerge_core.curves import Array, Curves
 from polymerge_core.evaluation.matching import Sections, compare, match, section_frechet
 from polymerge_core.evaluation.measures import METRES, SHARE, Measure, mean_of, ratio
 

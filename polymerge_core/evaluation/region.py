@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from polymerge_core.evaluation.curves import Array, Curves
+from polymerge_core.curves import Array, Curves
 from polymerge_core.evaluation.nearest import NearestLine
 
 #: The reference within this of an observation of its class was observed, metres.

@@ -13,9 +13,9 @@ import shapely
 from numpy.typing import NDArray
 
 from polymerge_core.crs import crs_name
+from polymerge_core.curves import Curves, count_up
 from polymerge_core.errors import OptionError
 from polymerge_core.evaluation import areas, detection, lengths, paired, region
-from polymerge_core.evaluation.curves import Curves, count_up
 from polymerge_core.evaluation.inputs import Maps, lines_of, read_maps
 from polymerge_core.evaluation.mapping import PcmSample, sample_pairs
 from polymerge_core.evaluation.matching import Sections, match

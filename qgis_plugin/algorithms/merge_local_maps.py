@@ -44,7 +44,15 @@ class MergeLocalMaps(LayerAlgorithm):
         return [
             *layer_parameters(),
             *column_parameters(),
-            choice_parameter("METHOD", tr("Method"), tr("polymerge: the method as it was published."), ("polymerge",)),
+            choice_parameter(
+                "METHOD",
+                tr("Method"),
+                tr(
+                    "polymerge: the method as it was published. consensus: one smooth line from all looks at it, more "
+                    "exact than each; what too few local maps saw is left out where footprints are known."
+                ),
+                ("polymerge", "consensus"),
+            ),
             share_parameter(
                 "COVERAGE",
                 tr("Coverage of areas"),

@@ -491,3 +491,17 @@ def test_a_companion_that_exists_is_told_before_the_work(run, tmp_path, monkeypa
     assert outcome.code == 1
     assert "m_tables.gpkg exists" in outcome.err
     assert (tmp_path / "m_tables.gpkg").read_bytes() == b"kept"
+
+
+def test_the_consensus_of_the_sample(run, tmp_path, sample_folder):
+    local, merged, report = (tmp_path / name for name in ("local.gpkg", "merged.gpkg", "report.json"))
+    predictions, poses = sample_folder / "predictions.json", sample_folder / "poses.csv"
+    assert run("project", predictions, "--poses", poses, "--crs", UTM, "-o", local).code == 0
+    done = run("merge", local, "--method", "consensus", "-o", merged, "--json", report)
+    assert done.code == 0
+    elements = look(merged, "elements")
+    assert elements["sigma_m"].notna().any()
+    assert elements["score"].between(0, 1).all()
+    assert set(look(merged, "lineage")["element_id"]) == set(elements["element_id"])
+    assert "seen by too few" in " ".join(look(merged, "left_out")["reason"])
+    assert json.loads(report.read_text())["corrections"]["shift_m_median"] > 0

@@ -80,14 +80,15 @@ class Curves:
         -------
         ndarray of float, shape (m, 2)
         """
-        length = self.length[line]
+        # Looks that cancel each other out can leave a line without length.
+        length = np.maximum(self.length[line], np.finfo(float).tiny)
         turns = np.where(self.closed[line], np.floor(position / length), 0.0)
         along = np.clip(position - turns * length, 0.0, length)
         laid = self._start[line] + along
         segment = np.searchsorted(self._laid, laid, side="right") - 1
         segment = np.clip(segment, self.bounds[line], self.bounds[line + 1] - 2)
         before, after = self._laid[segment], self._laid[segment + 1]
-        share = np.clip((laid - before) / (after - before), 0.0, 1.0)
+        share = np.clip((laid - before) / np.maximum(after - before, np.finfo(float).tiny), 0.0, 1.0)
         axes = (axis[segment] * (1 - share) + axis[segment + 1] * share for axis in self.vertices.T)
         return np.column_stack(tuple(axes))
 

@@ -1,0 +1,229 @@
+"""The lines that are being fused, as stations one proximity apart, and how they are smoothed.
+
+All lines of a class are held in one array, line after line, so that every step is one operation on all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+from scipy.spatial import cKDTree
+
+from polymerge_core.consensus.looks import cross, direction_at, dot
+from polymerge_core.curves import Array, Curves, Index, count_up
+
+#: Weight of the smoothing, in proximities to the sixth power: what is shorter than some ten proximities is taken
+#: for noise. Third differences leave parabolas, and so all gentle bends, as they are, up to their ends.
+SMOOTHING = 20.0
+
+#: Coefficients of the differences that the smoothing keeps small.
+_DIFFERENCE = (-1.0, 3.0, -3.0, 1.0)
+
+#: A station counts at most so many times as much as the middle one of all: where few looked, what they saw holds too.
+_MOST = 3.0
+
+#: Metres between two lines on the axis that tells them apart: more than any map is wide.
+_APART = 1e9
+
+#: Stations of a ring that are smoothed with it once more at either end.
+_AROUND = 30
+
+
+class Feet(NamedTuple):
+    """Where points fall on their own line, one entry a point."""
+
+    #: The nearest station of the line.
+    station: Index
+    #: Distance to the left of the line, metres.
+    lateral: Array
+    #: Direction of the line there, shape (p, 2).
+    tangent: Array
+    #: How far ahead of its station the point lies, metres.
+    ahead: Array
+    #: Whether the point lies beside the line, not beyond an end of it.
+    beside: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Lines by their stations.
+
+    Parameters
+    ----------
+    stations : ndarray of float, shape (s, 2)
+        Metres, line after line.
+    line : ndarray of int, shape (s,)
+        The line of each station, rising from 0; each line has two or more.
+    """
+
+    stations: Array
+    line: Index
+
+    @cached_property
+    def curves(self) -> Curves:
+        """The lines."""
+        return Curves(shapely.linestrings(self.stations, indices=self.line))
+
+    @cached_property
+    def first(self) -> Index:
+        """The first station of each line."""
+        return np.flatnonzero(np.diff(self.line, prepend=-1))
+
+    @cached_property
+    def counts(self) -> Index:
+        """How many stations each line has."""
+        return np.bincount(self.line)
+
+    @cached_property
+    def tangent(self) -> Array:
+        """Direction of the line at each station, shape (s, 2)."""
+        curves = self.curves
+        half = np.median(curves.length / np.maximum(self.counts - 1, 1)) if len(curves) else 1.0
+        return direction_at(curves, self.line, curves.arc, 1.5 * float(half))
+
+    @property
+    def normal(self) -> Array:
+        """Direction to the left of the line at each station, shape (s, 2)."""
+        return np.column_stack([-self.tangent[:, 1], self.tangent[:, 0]])
+
+    def spaced(self, step: float) -> Axes:
+        """Return the same lines with even stations at most a step apart."""
+        every = np.arange(len(self.curves))
+        points, owner = self.curves.resampled(every, np.zeros(len(every)), self.curves.length, step)
+        return Axes(points, owner)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        # Lines are told apart by a third axis, on which they are farther from each other than anything on the plane.
+        return cKDTree(np.column_stack([self.stations, _APART * self.line]), balanced_tree=False, compact_nodes=False)
+
+    def feet(self, points: Array, line: Index, unit: float) -> Feet:
+        """Project points onto given lines: to the segment before or after the nearest station."""
+        _, station = self._tree.query(np.column_stack([points, _APART * line]), workers=-1)
+        before = np.maximum(station - 1, self.first[line])
+        after = np.minimum(station + 1, self.first[line] + self.counts[line] - 1)
+        ring = self.curves.closed[line]
+        last = self.counts[line] - 1
+        before = np.where(ring & (station == self.first[line]), self.first[line] + last - 1, before)
+        after = np.where(ring & (station == self.first[line] + last), self.first[line] + 1, after)
+        offset = points - self.stations[station]
+        tangent = self.tangent[station]
+        ahead = dot(tangent, offset)
+        neighbour = np.where((ahead >= 0)[:, None], self.stations[after], self.stations[before])
+        chord = neighbour - self.stations[station]
+        square = (chord**2).sum(axis=1)
+        share = np.clip((chord * offset).sum(axis=1) / np.maximum(square, np.finfo(float).tiny), 0.0, 1.0)
+        rest = offset - share[:, None] * chord
+        beside = (square > 0) | (np.abs(ahead) <= 0.5 * unit)
+        lateral = cross(tangent, rest)
+        return Feet(self.alone(station), lateral, tangent, ahead, beside)
+
+    def alone(self, station: Index) -> Index:
+        """Return stations with the last one of a ring called by its first, which is the same."""
+        line = self.line[station]
+        last = self.curves.closed[line] & (station == self.first[line] + self.counts[line] - 1)
+        return np.where(last, self.first[line], station)
+
+    def around(self, values: Any) -> Any:
+        """Return values of stations with that of the first station of a ring given to its last, which is the same."""
+        ring = np.flatnonzero(self.curves.closed)
+        alike = values.copy()
+        alike[self.first[ring] + self.counts[ring] - 1] = values[self.first[ring]]
+        return alike
+
+    def reaching(self, feet: Feet, line: Index) -> Axes:
+        """Return the lines drawn out, or back, to where the first and the last of their points lie."""
+        lengthened = self.stations.copy()
+        last = self.first + self.counts - 1
+        for ends, sign in ((self.first, -1.0), (last, 1.0)):
+            here = np.flatnonzero(feet.station == ends[line])
+            far = np.full(len(ends), -np.inf)
+            np.maximum.at(far, line[here], sign * feet.ahead[here])
+            # No farther than a step: what lies beyond is reached in the next round.
+            step = np.hypot(*(self.stations[ends] - self.stations[ends - int(sign)]).T)
+            moved = np.where(np.isfinite(far) & ~self.curves.closed, np.clip(far, -0.4 * step, step), 0.0)
+            lengthened[ends] += (sign * moved)[:, None] * self.tangent[ends]
+        return Axes(lengthened, self.line)
+
+    def smoothed(self, weight: Array, strength: float = SMOOTHING) -> Axes:
+        """Return the lines drawn as smoothly as their stations' weights allow.
+
+        Parameters
+        ----------
+        weight : ndarray of float, shape (s,)
+            How well each station is known; 0 where nothing was seen.
+        strength : float
+            `SMOOTHING`.
+        """
+        known = weight[weight > 0]
+        relative = np.minimum(weight / np.median(known), _MOST) if len(known) else np.ones(len(weight))
+        # A ring goes on where it ends: it is smoothed with a piece of its own to either side.
+        order, series, middle = self._unrolled()
+        drawn = smooth(self.stations[order], relative[order], series, strength)[middle]
+        last = self.first + self.counts - 1
+        ring = self.curves.closed
+        drawn[last[ring]] = drawn[self.first[ring]]
+        return Axes(drawn, self.line)
+
+    def _unrolled(self) -> tuple[Index, Index, Index]:
+        """Return the stations to smooth (of rings some once more), their lines, and where each station lies there."""
+        ring = self.curves.closed
+        if not ring.any():
+            every = np.arange(len(self.stations))
+            return every, self.line, every
+        # The last station of a ring is its first one.
+        around = self.counts - 1
+        more = np.where(ring, np.minimum(_AROUND, around), 0)
+        sizes = self.counts + 2 * more
+        owner, number = count_up(sizes)
+        place = number - more[owner]
+        wrapped = np.where(ring[owner], place % around[owner], place)
+        middle = (np.cumsum(sizes) - sizes + more)[self.line] + np.arange(len(self.line)) - self.first[self.line]
+        return self.first[owner] + wrapped, owner, middle
+
+
+def smooth(values: Array, weight: Array, series: Index, strength: float) -> Array:
+    """Smooth many series at once: weighted least squares with a penalty on third differences.
+
+    Parameters
+    ----------
+    values : ndarray of float, shape (n, k)
+        Series after series, at even steps.
+    weight : ndarray of float, shape (n,)
+        Of each value; where it is 0 the series is continued from what is around.
+    series : ndarray of int, shape (n,)
+        The series of each value; rising.
+    strength : float
+        Weight of the penalty.
+
+    Returns
+    -------
+    ndarray of float, shape (n, k)
+
+    References
+    ----------
+    Whittaker 1923, "On a new method of graduation"; Eilers 2003, "A perfect smoother".
+    """
+    count, order = len(values), len(_DIFFERENCE) - 1
+    if count <= order:
+        return values
+    penalty = strength * (series[order:] == series[:-order])
+    # The penalty's matrix has few bands; the series do not touch in it, so all are solved as one.
+    bands = np.zeros((order + 1, count))
+    for row in range(order + 1):
+        for column in range(row, order + 1):
+            product = _DIFFERENCE[row] * _DIFFERENCE[column]
+            bands[order - (column - row), column : column + count - order] += product * penalty
+    # What nothing holds, such as a line of two stations without weight, stays where it is.
+    held = weight + 1e-9
+    bands[order] += held
+    # Near the origin, so that large coordinates lose nothing.
+    origin = values.mean(axis=0)
+    solved: Array = solveh_banded(bands, held[:, None] * (values - origin)) + origin
+    return solved

@@ -1,0 +1,177 @@
+"""One line from all looks at it: robust, weighted by what is known of the noise, smooth.
+
+At every station of a line its looks say how far to the left of it the true line lies. What the looks of one drive say
+is put together first, then the drives, because the frames of one drive share its errors of calibration and position.
+Looks that disagree with the others count less (iteratively reweighted least squares with Cauchy's weights), and how
+much noise there is, near the vehicle and far from it, is estimated from the looks themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polymerge_core.consensus.alongside import REACH
+from polymerge_core.consensus.axes import Axes, Feet
+from polymerge_core.consensus.looks import Looks
+from polymerge_core.curves import Array, Index
+
+#: The errors along a look are alike over this many proximities, so that it counts as one measurement over each of them.
+CORRELATION = 10.0
+
+#: A residual of so many standard deviations counts half.
+_HALF_WEIGHT = 2.0
+
+#: Median absolute deviation to standard deviation, for normal errors.
+_MAD = 1.4826
+
+#: Noise is taken to be at least this many proximities: less is told apart by nobody, and weights stay finite.
+_LEAST = 0.01
+
+#: Noise before any is known, proximities.
+FIRST_NOISE = 0.4
+
+_BINS = 6
+_FEW = 30
+
+
+class Fit(NamedTuple):
+    """Lines fitted to looks.
+
+    Parameters
+    ----------
+    axes : Axes
+        The lines.
+    feet : Feet
+        Where each point of the looks falls on its line.
+    used : ndarray of bool, shape (p,)
+        Which points lie beside their line.
+    sigma : ndarray of float, shape (p,)
+        Standard deviation of a look's lateral error at each point, metres.
+    drive_sigma : float
+        Standard deviation of the lateral error that all looks of a drive share, metres.
+    error : ndarray of float, shape (s,)
+        Standard error of each station, metres.
+    """
+
+    axes: Axes
+    feet: Feet
+    used: NDArray[np.bool_]
+    sigma: Array
+    drive_sigma: float
+    error: Array
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What is known of the looks' errors: `sigma` of each point and `drive_sigma`, metres."""
+
+    sigma: Array
+    drive_sigma: float = 0.0
+
+    @classmethod
+    def unknown(cls, looks: Looks) -> Noise:
+        """Return the noise to begin with."""
+        return cls(np.full(len(looks.points), FIRST_NOISE * looks.unit))
+
+
+def fuse(looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 2) -> Fit:
+    """Fit lines to their looks.
+
+    Parameters
+    ----------
+    looks : Looks
+        Of one class.
+    group : ndarray of int, shape (n,)
+        The line of each look.
+    axes : Axes
+        The lines to begin with.
+    noise : Noise
+        What is known of the errors.
+    rounds : int, default 2
+        How often the lines are moved and the looks projected onto them anew.
+
+    Returns
+    -------
+    Fit
+        The noise in it is estimated anew from the residuals.
+    """
+    line = group[looks.owner]
+    error = np.empty(0)
+    for _ in range(rounds):
+        axes = axes.reaching(axes.feet(looks.points, line, looks.unit), line).spaced(looks.unit)
+        feet, used = _feet(looks, axes, line)
+        offset, weight = map(axes.around, _offsets(looks, feet, used, noise, len(axes.line)))
+        # Rounding must not open a ring.
+        moved = axes.around(axes.stations + offset[:, None] * axes.normal)
+        axes = Axes(moved, axes.line).smoothed(weight)
+        error = 1.0 / np.sqrt(np.maximum(weight, np.finfo(float).tiny))
+    feet, used = _feet(looks, axes, line)
+    sigma = _noise_by_distance(looks, group, feet, used)
+    return Fit(axes, feet, used, sigma, _noise_of_drives(looks, feet, used, sigma), error)
+
+
+def _feet(looks: Looks, axes: Axes, line: Index) -> tuple[Feet, NDArray[np.bool_]]:
+    feet = axes.feet(looks.points, line, looks.unit)
+    return feet, feet.beside & (np.abs(feet.lateral) <= 2 * REACH * looks.unit)
+
+
+def _offsets(looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, count: int) -> tuple[Array, Array]:
+    """Return how far to the left of each station its looks lie, and how surely (1 / variance)."""
+    rows = np.flatnonzero(used)
+    station, lateral, sigma = feet.station[rows], feet.lateral[rows], noise.sigma[rows]
+    drive = looks.instances.drive[looks.point_instance[rows]]
+    drives = int(drive.max(initial=0)) + 1
+    cell, place = np.unique(station * drives + drive, return_inverse=True)
+    information = looks.weight[looks.owner[rows]] * looks.metres[rows] / looks.unit / sigma**2
+    middle, scale = np.zeros(count), _HALF_WEIGHT * sigma
+    offset = weight = middle
+    for _ in range(3):
+        robust = information / (1 + ((lateral - middle[station]) / scale) ** 2)
+        total = np.bincount(place, robust)
+        said = np.bincount(place, robust * lateral) / np.maximum(total, np.finfo(float).tiny)
+        sure = 1.0 / (noise.drive_sigma**2 + 1.0 / np.maximum(total, np.finfo(float).tiny))
+        if noise.drive_sigma > 0:
+            sure /= 1 + ((said - middle[cell // drives]) / (_HALF_WEIGHT * 2 * noise.drive_sigma)) ** 2
+        weight = np.bincount(cell // drives, sure, minlength=count).astype(float)
+        offset = np.bincount(cell // drives, sure * said, minlength=count) / np.maximum(weight, np.finfo(float).tiny)
+        middle = offset
+    return offset, weight
+
+
+def _noise_by_distance(looks: Looks, group: Index, feet: Feet, used: NDArray[np.bool_]) -> Array:
+    """Estimate the standard deviation of the lateral error at each point, linear in the distance from the vehicle."""
+    size = np.bincount(group)[group]
+    judged = np.flatnonzero(used & (size >= 3)[looks.owner])
+    least = _LEAST * looks.unit
+    if len(judged) < _FEW:
+        return np.full(len(used), FIRST_NOISE * looks.unit)
+    residual, distance = np.abs(feet.lateral[judged]), looks.distance
+    edges = np.unique(np.quantile(distance[judged], np.linspace(0, 1, _BINS + 1)))
+    if len(edges) < 3:
+        return np.full(len(used), max(least, _MAD * float(np.median(residual))))
+    bin_of = np.clip(np.searchsorted(edges, distance[judged], side="right") - 1, 0, len(edges) - 2)
+    where = np.array([distance[judged][bin_of == number].mean() for number in range(len(edges) - 1)])
+    spread = np.array([_MAD * np.median(residual[bin_of == number]) for number in range(len(edges) - 1)])
+    slope = max(0.0, float(np.polyfit(where, spread, 1)[0]))
+    base = max(0.2 * float(spread.mean()), float(spread.mean() - slope * where.mean()))
+    return np.maximum(least, base + slope * distance)
+
+
+def _noise_of_drives(looks: Looks, feet: Feet, used: NDArray[np.bool_], sigma: Array) -> float:
+    """Estimate the standard deviation of the lateral error that the looks of a drive share; 0 where one drove alone."""
+    rows = np.flatnonzero(used)
+    drive = looks.instances.drive[looks.point_instance[rows]]
+    drives = int(drive.max(initial=0)) + 1
+    cell, place, number = np.unique(feet.station[rows] * drives + drive, return_inverse=True, return_counts=True)
+    station, seen = np.unique(cell // drives, return_counts=True)
+    judged = (seen >= 3)[np.searchsorted(station, cell // drives)]
+    if not judged.any():
+        return 0.0
+    mean = np.bincount(place, feet.lateral[rows]) / number
+    own = np.bincount(place, sigma[rows] ** 2) / number**2
+    spread = _MAD * float(np.median(np.abs(mean[judged])))
+    return float(np.sqrt(max(0.0, spread**2 - float(np.median(own[judged])))))

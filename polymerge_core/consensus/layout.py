@@ -1,0 +1,143 @@
+"""From looks that overlap by pairs to positions along one line: where along its line each look begins, and which way.
+
+Each pair says how a position along the one is a position along the other. The ways round are settled along a spanning
+tree of the closest pairs, the positions by least squares over all pairs (synchronisation): no look is the first.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.sparse.linalg import spsolve
+
+from polymerge_core.consensus.alongside import Pairs
+from polymerge_core.consensus.axes import Axes
+from polymerge_core.consensus.looks import Looks
+from polymerge_core.curves import Array, Index
+
+#: Weight of a look's own zero against that of its pairs: enough to make the equations solvable, too little to matter.
+_ANCHOR = 1e-6
+
+
+def first_axes(looks: Looks, pairs: Pairs, group: Index, weight: Array) -> Axes:
+    """Draw the first line of each group: the weighted mean of its looks at each position.
+
+    Parameters
+    ----------
+    looks : Looks
+        Of one class.
+    pairs : Pairs
+        From `pairs_alongside`.
+    group : ndarray of int, shape (n,)
+        The group of each look, 0, 1, ...; each group connected by pairs.
+    weight : ndarray of float, shape (p,)
+        Of each point.
+
+    Returns
+    -------
+    Axes
+        One line a group.
+    """
+    own = pairs.take((group[pairs.short] == group[pairs.long]) & (pairs.overlap > 0))
+    sense = _senses(len(looks), own)
+    begin = _beginnings(len(looks), own, sense)
+    position = (sense[looks.owner] * looks.arc + begin[looks.owner]) / looks.unit
+    of_point, count = group[looks.owner], int(group.max()) + 1
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(low, of_point, position)
+    np.maximum.at(high, of_point, position)
+    # Equal steps of at most one proximity from end to end, so that both ends are alike.
+    extent = np.maximum(high - low, np.finfo(float).tiny)
+    steps = np.maximum(np.ceil(extent - 1e-9), 1).astype(np.intp)
+    place = np.round((position - low[of_point]) / extent[of_point] * steps[of_point]).astype(np.intp)
+    sizes = steps + 1
+    station = (np.cumsum(sizes) - sizes)[of_point] + place
+    total = np.bincount(station, weight, minlength=int(sizes.sum())).astype(float)
+    sums = [np.bincount(station, weight * axis, minlength=len(total)) for axis in looks.points.T]
+    mean = np.column_stack(sums) / np.where(total > 0, total, 1.0)[:, None]
+    line = np.repeat(np.arange(count), sizes)
+    mean[total == 0] = _mean_points(looks, of_point, count)[line[total == 0]]
+    return _with_rings(looks, group, Axes(mean, line).smoothed(total))
+
+
+def _with_rings(looks: Looks, group: Index, axes: Axes) -> Axes:
+    """Take a look itself where a group's looks are rings for the most part: the one of middle length."""
+    curves = looks.curves
+    count = int(group.max()) + 1
+    length = np.bincount(group, curves.length, minlength=count)
+    closed = np.bincount(group, curves.length * curves.closed, minlength=count)
+    chosen = np.flatnonzero(curves.closed & (closed > length / 2)[group])
+    if len(chosen) == 0:
+        return axes
+    order = chosen[np.lexsort((curves.length[chosen], group[chosen]))]
+    _, first, size = np.unique(group[order], return_index=True, return_counts=True)
+    ring = order[first + size // 2]
+    points, owner = curves.resampled(ring, np.zeros(len(ring)), curves.length[ring], looks.unit)
+    points[np.flatnonzero(np.diff(owner, append=-1))] = points[np.flatnonzero(np.diff(owner, prepend=-1))]
+    stays = ~np.isin(axes.line, group[ring])
+    line = np.concatenate([axes.line[stays], group[ring][owner]])
+    rank = np.argsort(line, kind="stable")
+    return Axes(np.concatenate([axes.stations[stays], points])[rank], line[rank])
+
+
+def _mean_points(looks: Looks, of_point: Index, count: int) -> Array:
+    sizes = np.bincount(of_point, minlength=count)
+    return np.column_stack([np.bincount(of_point, axis, minlength=count) / sizes for axis in looks.points.T])
+
+
+def _senses(count: int, pairs: Pairs) -> Array:
+    """Return 1 or -1 for each look, so that those of a group run the same way round."""
+    # The closest and longest overlaps are the surest; a spanning tree takes those first. Costs must not be zero.
+    cost = (1.0 + pairs.square) / pairs.overlap
+    tree = minimum_spanning_tree(coo_array((cost, (pairs.short, pairs.long)), shape=(count, count)).tocsr())
+    senses = coo_array((pairs.sense, (pairs.short, pairs.long)), shape=(count, count)).tocsr()
+    chosen = tree.tocoo()
+    sense = np.asarray(senses[chosen.row, chosen.col]).ravel()
+    parent, depth, edge = _rooted(count, chosen.row, chosen.col)
+    found = np.ones(count)
+    for level in range(1, int(depth.max(initial=0)) + 1):
+        rows = np.flatnonzero(depth == level)
+        found[rows] = found[parent[rows]] * sense[edge[rows]]
+    return found
+
+
+def _rooted(count: int, first: Index, second: Index) -> tuple[Index, Index, Index]:
+    """Hang every tree of a forest from its first node: parent, depth and the edge to the parent of each node."""
+    parent, depth, edge = np.full(count, -1), np.zeros(count, np.intp), np.full(count, -1)
+    if len(first) == 0:
+        return parent, depth, edge
+    # One root above all trees makes one tree of the forest, which is walked through once.
+    members = coo_array((np.ones(len(first)), (first, second)), shape=(count + 1, count + 1)).tocsr()
+    roots = _first_of_each_tree(count, first, second)
+    above = coo_array((np.ones(len(roots)), (np.full(len(roots), count), roots)), shape=(count + 1, count + 1))
+    order, before = breadth_first_order((members + above.tocsr()).tocsr(), count, directed=False)
+    parent = before[:count].astype(np.intp)
+    parent[parent == count] = -1
+    for node in order[1:].tolist():
+        depth[node] = 0 if parent[node] < 0 else depth[parent[node]] + 1
+    hung = np.flatnonzero(parent >= 0)
+    key = np.minimum(first, second) * count + np.maximum(first, second)
+    rank = np.argsort(key)
+    wanted = np.minimum(hung, parent[hung]) * count + np.maximum(hung, parent[hung])
+    edge[hung] = rank[np.searchsorted(key[rank], wanted)]
+    return parent, depth, edge
+
+
+def _first_of_each_tree(count: int, first: Index, second: Index) -> Index:
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
+    _, tree = connected_components(graph, directed=False)
+    return np.unique(tree, return_index=True)[1]
+
+
+def _beginnings(count: int, pairs: Pairs, sense: Array) -> Array:
+    """Return where each look's position 0 lies along its line, metres, by least squares over all pairs."""
+    agree = pairs.take(sense[pairs.long] == sense[pairs.short] * pairs.sense)
+    short, long, weight = agree.short, agree.long, agree.overlap
+    # sense_long * (sense * x + shift) + begin_long = sense_short * x + begin_short, for every x of the overlap.
+    ahead = -sense[long] * agree.shift
+    rows, columns = np.concatenate([short, long, short, long]), np.concatenate([short, long, long, short])
+    values = np.concatenate([weight, weight, -weight, -weight])
+    matrix = coo_array((values, (rows, columns)), shape=(count, count)) + diags_array(np.full(count, _ANCHOR))
+    target = np.bincount(long, weight * ahead, minlength=count) - np.bincount(short, weight * ahead, minlength=count)
+    return np.asarray(spsolve(matrix.tocsc(), target))

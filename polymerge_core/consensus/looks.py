@@ -1,0 +1,147 @@
+"""What the consensus works on: the looks at one class of lines, as flat arrays.
+
+A look is one observation: what one local map saw of one line. All lengths are in units of the proximity, which is the
+only scale of the method: a look is followed at steps of one proximity, and so is a merged line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from polymerge_core.curves import Array, Curves, Index, count_up
+
+#: Directions are taken over this many proximities to either side.
+_HALF_CHORD = 1.5
+
+
+@dataclass(frozen=True)
+class Instances:
+    """The local maps behind the looks, one entry a local map.
+
+    Parameters
+    ----------
+    drive : ndarray of int, shape (k,)
+        Which drive each belongs to.
+    footprint : ndarray of Polygon, shape (k,), or None
+        The area that each looked at, metres; None where it is not known.
+    position : ndarray of float, shape (k, 2)
+        Where each was taken, metres; NaN where it is not known.
+    heading : ndarray of float, shape (k,)
+        Direction of each, radians counter-clockwise from x; NaN where it is not known.
+    """
+
+    drive: Index
+    footprint: NDArray[np.object_] | None
+    position: Array
+    heading: Array
+
+    def __len__(self) -> int:
+        return len(self.drive)
+
+    def by_drive(self) -> Instances:
+        """Return the drives, each as one local map that looked wherever any of its frames did."""
+        count = int(self.drive.max(initial=-1)) + 1
+        footprint = None
+        if self.footprint is not None:
+            order = np.argsort(self.drive, kind="stable")
+            parts = np.split(self.footprint[order], np.flatnonzero(np.diff(self.drive[order])) + 1)
+            footprint = np.array([shapely.union_all(part) for part in parts], dtype=object)
+            shapely.prepare(footprint)
+        unknown = np.full(count, np.nan)
+        return Instances(np.arange(count), footprint, np.column_stack([unknown, unknown]), unknown)
+
+
+@dataclass(frozen=True)
+class Looks:
+    """Looks at lines of one class, and points along them.
+
+    Parameters
+    ----------
+    curves : Curves
+        The looks, metres.
+    instance : ndarray of int, shape (n,)
+        The local map of each look.
+    weight : ndarray of float, shape (n,)
+        How much each counts: its score, times the observations that it stands for.
+    instances : Instances
+        The local maps.
+    unit : float
+        The proximity, metres.
+    owner : ndarray of int, shape (p,)
+        The look of each point.
+    arc, metres : ndarray of float, shape (p,)
+        Where each point lies along its look, and how much of it it stands for, metres.
+    points, tangent : ndarray of float, shape (p, 2)
+        The points, moved by what registration found, and the direction of their look there.
+    """
+
+    curves: Curves
+    instance: Index
+    weight: Array
+    instances: Instances
+    unit: float
+    owner: Index
+    arc: Array
+    metres: Array
+    points: Array
+    tangent: Array
+
+    @classmethod
+    def of(cls, lines: NDArray[np.object_], instance: Index, weight: Array, instances: Instances, unit: float) -> Looks:
+        """Follow lines at steps of one proximity."""
+        curves = Curves(lines)
+        every = np.arange(len(curves))
+        points, owner = curves.resampled(every, np.zeros(len(curves)), curves.length, unit)
+        counts = np.bincount(owner, minlength=len(curves))
+        _, number = count_up(counts)
+        arc = number * (curves.length / (counts - 1))[owner]
+        tangent = direction_at(curves, owner, arc, _HALF_CHORD * unit)
+        metres = (curves.length / counts)[owner]
+        return cls(curves, instance, weight, instances, unit, owner, arc, metres, points, tangent)
+
+    def __len__(self) -> int:
+        return len(self.curves)
+
+    @property
+    def point_instance(self) -> Index:
+        """The local map of each point."""
+        return self.instance[self.owner]
+
+    @property
+    def distance(self) -> Array:
+        """How far each point was from where its local map was taken, metres; 0 where that is not known."""
+        away = np.hypot(*(self.points - self.instances.position[self.point_instance]).T)
+        return np.nan_to_num(away)
+
+    def redrawn(self) -> Looks:
+        """Return the looks as they lie now, after all corrections."""
+        lines = shapely.linestrings(self.points, indices=self.owner)
+        return Looks.of(lines, self.instance, self.weight, self.instances, self.unit)
+
+    def moved(self, points: Array) -> Looks:
+        """Return the same looks with their points elsewhere."""
+        return replace(self, points=points)
+
+
+def direction_at(curves: Curves, line: Index, position: Array, half: float) -> Array:
+    """Return unit vectors along lines at positions, from the chord over `half` metres to either side."""
+    around = curves.closed[line]
+    low = np.where(around, position - half, np.maximum(position - half, 0.0))
+    high = np.where(around, position + half, np.minimum(position + half, curves.length[line]))
+    chord = curves.points_at(line, high) - curves.points_at(line, low)
+    length = np.maximum(np.hypot(chord[:, 0], chord[:, 1]), np.finfo(float).tiny)
+    return np.asarray(chord / length[:, None])
+
+
+def cross(first: Array, second: Array) -> Array:
+    """Return how far `second` lies to the left of unit vectors `first`."""
+    return np.asarray(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+
+
+def dot(first: Array, second: Array) -> Array:
+    """Return how far `second` reaches along unit vectors `first`."""
+    return np.asarray((first * second).sum(axis=1))

@@ -1,0 +1,103 @@
+"""Which line each look belongs to, asked again once the lines are known.
+
+Association compares looks by pairs; a look that happens to lie close to the wrong one is found out by the lines. A look
+counts for a line only where others saw it too, so that it cannot speak for itself.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from polymerge_core.consensus.alongside import ANGLE_DEG, REACH
+from polymerge_core.consensus.axes import Axes
+from polymerge_core.consensus.looks import Looks, cross, dot
+from polymerge_core.curves import Array, Index
+
+#: Stations of lines that are looked at for each point.
+_NEAREST = 8
+
+#: So many other looks say as much about a line as any more.
+_ENOUGH = 3
+
+
+class Beside(NamedTuple):
+    """Points and the lines that they run beside, one entry a point and line."""
+
+    point: Index
+    station: Index
+    line: Index
+    #: Metres to the left of the line.
+    lateral: Array
+
+
+def points_beside(looks: Looks, axes: Axes) -> Beside:
+    """Find the lines that each point of the looks runs beside, within reach and in their direction."""
+    tree = cKDTree(axes.stations)
+    count = min(_NEAREST, len(axes.stations))
+    far = (REACH + 0.5) * looks.unit
+    distance, station = tree.query(looks.points, k=np.arange(1, count + 1), distance_upper_bound=far)
+    point, rank = np.nonzero(np.isfinite(distance))
+    station = station[point, rank]
+    tangent = axes.tangent[station]
+    offset = looks.points[point] - axes.stations[station]
+    lateral, ahead = cross(tangent, offset), np.abs(dot(tangent, offset))
+    straight = np.abs(dot(tangent, looks.tangent[point])) > np.cos(np.radians(ANGLE_DEG))
+    kept = straight & (np.abs(lateral) <= REACH * looks.unit) & (ahead <= 0.75 * looks.unit)
+    point, station, lateral, ahead = point[kept], axes.alone(station[kept]), lateral[kept], ahead[kept]
+    line = axes.line[station]
+    order = np.lexsort((ahead, line, point))
+    key = point[order] * (int(axes.line.max(initial=0)) + 1) + line[order]
+    nearest = order[np.diff(key, prepend=-1) != 0]
+    return Beside(point[nearest], station[nearest], line[nearest], lateral[nearest])
+
+
+def seen_by(looks: Looks, group: Index, beside: Beside, stations: int) -> Index:
+    """Count the local maps whose looks at a line run beside each of its stations."""
+    own = beside.line == group[looks.owner[beside.point]]
+    instances = len(looks.instances)
+    pairs = np.unique(beside.station[own] * instances + looks.point_instance[beside.point[own]])
+    return np.bincount(pairs // instances, minlength=stations)
+
+
+def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
+    """Give each look to the line that it agrees with over the greatest length.
+
+    Parameters
+    ----------
+    looks : Looks
+        Of one class.
+    axes : Axes
+        The lines.
+    group : ndarray of int, shape (n,)
+        The line of each look so far.
+    kind : ndarray of int, shape (n,)
+        A look stays among those of its kind.
+
+    Returns
+    -------
+    ndarray of int, shape (n,)
+        The line of each look, numbered anew from 0.
+    """
+    beside = points_beside(looks, axes)
+    seen = seen_by(looks, group, beside, len(axes.line))
+    owner = looks.owner[beside.point]
+    own = beside.line == group[owner]
+    others = np.clip(seen[beside.station] - own, 0, _ENOUGH) / _ENOUGH
+    limit = looks.unit * (REACH if looks.instances.footprint is not None else 1.0)
+    of_line = np.zeros(int(axes.line.max(initial=0)) + 1, np.intp)
+    of_line[group] = kind
+    alike = of_line[beside.line] == kind[owner]
+    agrees = alike * (1 - (beside.lateral / limit) ** 2) * others * looks.metres[beside.point]
+    lines = len(of_line)
+    key, place = np.unique(owner * lines + beside.line, return_inverse=True)
+    total = np.bincount(place, agrees)
+    look, line = key // lines, key % lines
+    order = np.lexsort((line != group[look], -np.round(total, 9), look))
+    best = order[np.diff(look[order], prepend=-1) != 0]
+    best = best[total[best] > 0]
+    settled = group.copy()
+    settled[look[best]] = line[best]
+    return np.unique(settled, return_inverse=True)[1]

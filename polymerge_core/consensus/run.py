@@ -1,0 +1,314 @@
+"""From observations to the merged map: the consensus of every class, and which piece of which observation is in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from polymerge_core.consensus.areas import Areas, merge_looks_at_areas
+from polymerge_core.consensus.lines import Lines, merge_lines
+from polymerge_core.consensus.looks import Instances, Looks
+from polymerge_core.consensus.registration import centres, moved_by
+from polymerge_core.crs import transform_coordinates
+from polymerge_core.curves import Array, Curves, Index
+from polymerge_core.errors import InputError
+from polymerge_core.observations import MIN_SEGMENT_M, Observations
+from polymerge_core.options import Options
+from polymerge_core.schema import LEFT_OUT_COLUMNS, LocalMaps
+from polymerge_core.sets import ElementSets
+
+#: Why a piece of an observation is in no element.
+UNSUPPORTED = "seen by too few of the local maps that looked there"
+
+#: More steps than this along all observations are a proximity that is too small for them (some 500 bytes each).
+MOST_POINTS = 20_000_000
+
+#: A score of 0 still counts this much, so that something comes of observations that all have it.
+_LEAST_WEIGHT = 1e-3
+
+#: An observation is not cut into pieces shorter than this, proximities.
+_PIECE = 2.0
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """The merged map in the terms of the observations.
+
+    Parameters
+    ----------
+    observations : Observations
+        One row a piece of an observation that went into an element; what went into none is in its `left_out`.
+    sets : ElementSets
+        Which pieces are which element.
+    shapes : ndarray of shapely geometries, shape (m,)
+        Of the elements, metres.
+    columns : dict of ndarray
+        `score` and `sigma_m` of the elements.
+    corrections : ndarray of float, shape (k, 3)
+        How each local map was moved: metres east and north, radians counter-clockwise.
+    """
+
+    observations: Observations
+    sets: ElementSets
+    shapes: NDArray[np.object_]
+    columns: dict[str, Array]
+    corrections: Array
+
+
+class _Pieces(NamedTuple):
+    """Pieces of observations: the observation, from where to where as shares of it, and its element (-1: none)."""
+
+    row: Index
+    start: Array
+    stop: Array
+    element: Index
+
+
+def merge_by_consensus(
+    observations: Observations, local_maps: Sequence[LocalMaps], options: Options, advance: Callable[[float], object]
+) -> Consensus:
+    """Merge all observations, class by class.
+
+    Parameters
+    ----------
+    observations : Observations
+        All of them, main map first.
+    local_maps : sequence of LocalMaps
+        Where they came from, with what is known of the local maps.
+    options : Options
+        The proximity.
+    advance : callable
+        Called with the share done.
+
+    Returns
+    -------
+    Consensus
+        Elements by class; lines before areas.
+
+    Raises
+    ------
+    InputError
+        If the proximity is too small for so much length.
+    """
+    table = observations.table
+    points = float(table.loc[~table["is_area"], "length_m"].sum()) / options.proximity
+    if points > MOST_POINTS:
+        raise InputError(
+            f"{points / 1e6:.0f} million steps of the proximity ({options.proximity:g} m) lie along the observations, "
+            f"more than the {MOST_POINTS / 1e6:.0f} million that memory is sure to hold; choose a larger proximity, or "
+            "merge the data in parts"
+        )
+    instances, instance = read_instances(table, local_maps, observations.crs)
+    weight = table["weight"].to_numpy(dtype=float) * np.maximum(table["score"].to_numpy(dtype=float), _LEAST_WEIGHT)
+    shapes, is_area = table["shape"].to_numpy(dtype=object), table["is_area"].to_numpy(dtype=bool)
+    rows_of: list[Index] = [np.asarray(rows) for _, rows in sorted(table.groupby(["is_area", "class"]).indices.items())]
+    line_rows = [rows for rows in rows_of if not is_area[rows[0]]]
+    looks = [Looks.of(shapes[rows], instance[rows], weight[rows], instances, options.proximity) for rows in line_rows]
+    lines, corrections = merge_lines(looks, lambda share: advance(0.9 * share))
+    if looks:
+        centre = centres(looks, len(instances))
+        areas = np.flatnonzero(is_area)
+        shapes = shapes.copy()
+        shapes[areas] = moved_by(shapes[areas], instance[areas], corrections, centre)
+    found: list[Lines | Areas] = []
+    pieces: list[_Pieces] = []
+    for rows, each, seen in zip(line_rows, lines, looks, strict=True):
+        pieces.append(_pieces_of_lines(rows, each, seen, sum(len(one.shapes) for one in found), _PIECE))
+        found.append(each)
+    for rows in (rows for rows in rows_of if is_area[rows[0]]):
+        area = merge_looks_at_areas(shapes[rows], instance[rows], weight[rows], instances, options.proximity)
+        pieces.append(_pieces_of_areas(rows, area, sum(len(one.shapes) for one in found)))
+        found.append(area)
+    advance(1.0)
+    return _put_together(observations, found, _joined(pieces), corrections)
+
+
+def read_instances(table: pd.DataFrame, local_maps: Sequence[LocalMaps], crs: pyproj.CRS) -> tuple[Instances, Index]:
+    """Bring the local maps of a merge together: those of the observations, then those that saw nothing.
+
+    Parameters
+    ----------
+    table : DataFrame
+        The observations, with `drive`, `instance` and `group`.
+    local_maps : sequence of LocalMaps
+        Their layers, with `instances` where these are known.
+    crs : pyproj.CRS
+        Of the work.
+
+    Returns
+    -------
+    instances : Instances
+        Footprints are known where they are of all local maps.
+    instance : ndarray of int
+        The local map of each observation.
+    """
+    codes, groups = pd.factorize(table["group"])
+    firsts = table.drop_duplicates("group").set_index("group").loc[groups]
+    names = firsts[["drive", "instance"]].astype(str).reset_index(drop=True)
+    frames = [_known(maps.instances, crs) for maps in local_maps if maps.instances is not None]
+    known = pd.concat([names.iloc[:0], *frames], ignore_index=True).drop_duplicates(["drive", "instance"])
+    every = pd.concat([names, known[["drive", "instance"]]], ignore_index=True)
+    # Local maps that have observations come first, also where several go by one name.
+    every = every[~(every.duplicated() & (np.arange(len(every)) >= len(names)))]
+    rows = pd.MultiIndex.from_frame(known[["drive", "instance"]]).get_indexer(pd.MultiIndex.from_frame(every))
+    position, heading, footprint = np.full((len(every), 2), np.nan), np.full(len(every), np.nan), None
+    there = rows >= 0
+    if there.any():
+        position[there] = known[["x", "y"]].to_numpy(dtype=float)[rows[there]]
+        heading[there] = known["heading"].to_numpy(dtype=float)[rows[there]]
+    if there.all() and len(every):
+        footprint = known["footprint"].to_numpy(dtype=object)[rows]
+        shapely.prepare(footprint)
+    return Instances(pd.factorize(every["drive"])[0], footprint, position, heading), codes
+
+
+def _known(frame: gpd.GeoDataFrame, crs: pyproj.CRS) -> pd.DataFrame:
+    """Return drive, instance, position, heading (radians counter-clockwise from x) and footprint, in the work's CRS."""
+    places, areas = frame[["x", "y"]].to_numpy(dtype=float), frame.geometry.to_numpy()
+    if frame.crs is not None and frame.crs != crs:
+        source = pyproj.CRS.from_user_input(frame.crs)
+        places = transform_coordinates(places, source, crs)
+        areas = shapely.transform(areas, lambda xy: transform_coordinates(xy, source, crs))
+    columns = {name: frame[name].astype(str).to_numpy() for name in ("drive", "instance")}
+    heading = np.radians(90.0 - frame["heading"].to_numpy(dtype=float))
+    return pd.DataFrame({**columns, "x": places[:, 0], "y": places[:, 1], "heading": heading, "footprint": areas})
+
+
+def _pieces_of_lines(rows: Index, lines: Lines, looks: Looks, first: int, shortest: float) -> _Pieces:
+    """Cut observations where their points went into another element, or into none."""
+    owner, element = lines.owner, _steady(lines, looks, shortest)
+    begins = (np.diff(owner, prepend=-1) != 0) | (np.diff(element, prepend=-2) != 0)
+    run = np.flatnonzero(begins)
+    length = looks.curves.length[owner[run]]
+    # Halfway between the last point of one piece and the first of the next.
+    before = np.where(run > 0, lines.arc[run - 1], 0.0)
+    opens = np.diff(owner[run], prepend=-1) != 0
+    start = np.where(opens, 0.0, (before + lines.arc[run]) / 2)
+    stop = np.append(start[1:], 0.0)
+    last = np.append(opens[1:], [True])
+    number = element[run]
+    where = np.where(number >= 0, number + first, -1)
+    return _Pieces(rows[owner[run]], start / length, np.where(last, 1.0, stop / length), where)
+
+
+def _steady(lines: Lines, looks: Looks, shortest: float) -> Index:
+    """Give pieces too short to be told apart to the piece before them, or after, of the same observation."""
+    owner, element = lines.owner, lines.element.copy()
+    for _ in range(3):
+        begins = np.flatnonzero((np.diff(owner, prepend=-1) != 0) | (np.diff(element, prepend=-2) != 0))
+        size = np.diff(np.append(begins, len(owner)))
+        metres = np.add.reduceat(looks.metres, begins) if len(begins) else np.empty(0)
+        short = np.flatnonzero(metres < shortest * looks.unit)
+        same_before = (short > 0) & (owner[begins[short]] == owner[begins[np.maximum(short - 1, 0)]])
+        after = np.minimum(short + 1, len(begins) - 1)
+        same_after = (short < len(begins) - 1) & (owner[begins[short]] == owner[begins[after]])
+        taken = np.where(same_before, short - 1, np.where(same_after, after, short))
+        # All at once: what is short on both sides takes the name that its neighbour had.
+        element = np.repeat(_renamed(element[begins], short, taken), size)
+    return element
+
+
+def _renamed(values: Index, rows: Index, taken: Index) -> Index:
+    renamed = values.copy()
+    renamed[rows] = values[taken]
+    return renamed
+
+
+def _pieces_of_areas(rows: Index, areas: Areas, first: int) -> _Pieces:
+    number = np.where(areas.element >= 0, areas.element + first, -1)
+    return _Pieces(rows, np.zeros(len(rows)), np.ones(len(rows)), number)
+
+
+def _joined(pieces: list[_Pieces]) -> _Pieces:
+    if not pieces:
+        none = np.empty(0, np.intp)
+        return _Pieces(none, np.empty(0), np.empty(0), none)
+    return _Pieces._make(np.concatenate(column) for column in zip(*pieces, strict=True))
+
+
+def _put_together(
+    observations: Observations, found: list[Lines | Areas], pieces: _Pieces, corrections: Array
+) -> Consensus:
+    """Make the tables of a merge from elements and pieces; an element that no piece is left of is none."""
+    order = np.lexsort((pieces.start, pieces.row))
+    pieces = _Pieces._make(column[order] for column in pieces)
+    inside = pieces.element >= 0
+    used = np.unique(pieces.element[inside])
+    table = _piece_table(observations.table, pieces)
+    component = np.searchsorted(used, pieces.element[inside])
+    kept = table[inside].reset_index(drop=True)
+    shapes, sigma, seen, expected = (
+        np.concatenate([getattr(each, name) for each in found])[used] if found else np.empty(0, dtype=object)
+        for name in ("shapes", "sigma", "seen", "expected")
+    )
+    left_out = table[~inside].assign(reason=UNSUPPORTED)[list(LEFT_OUT_COLUMNS)]
+    listed = pd.concat([observations.left_out, left_out], ignore_index=True)
+    chosen = replace(
+        observations,
+        table=kept,
+        attributes=observations.attributes.iloc[pieces.row[inside]].reset_index(drop=True),
+        left_out=listed,
+    )
+    sets = _sets(kept, component, len(used))
+    # A scribble that turns back on itself may average out to a point: it is better told by its longest look.
+    shapes = np.where(shapely.length(shapes) > MIN_SEGMENT_M, shapes, kept["shape"].to_numpy(dtype=object)[sets.base])
+    total = np.bincount(component, kept["weight"], len(used))
+    mean = np.bincount(component, kept["weight"] * kept["score"], len(used)) / np.maximum(total, 1)
+    # The rule of succession: how surely one that looks there sees it.
+    confidence = mean * (seen + 1) / (np.maximum(expected, seen) + 2)
+    return Consensus(chosen, sets, shapes, {"score": confidence.astype(float), "sigma_m": sigma}, corrections)
+
+
+def _piece_table(table: pd.DataFrame, pieces: _Pieces) -> pd.DataFrame:
+    """Return one row a piece; only the first one of an observation in an element counts as an observation of it."""
+    rows = table.iloc[pieces.row].reset_index(drop=True)
+    whole = (pieces.start == 0.0) & (pieces.stop == 1.0)
+    extent = rows["length_m"].to_numpy(dtype=float)
+    begin = rows["from_m"].to_numpy(dtype=float)
+    rows["to_m"] = np.where(pieces.stop == 1.0, rows["to_m"], begin + pieces.stop * extent)
+    rows["from_m"] = begin + pieces.start * extent
+    rows["length_m"] = (pieces.stop - pieces.start) * extent
+    cut = np.flatnonzero(~whole)
+    for column in ("shape", "original"):
+        geometry = rows[column].to_numpy(dtype=object, copy=True)
+        geometry[cut] = _substrings(geometry[cut], pieces.start[cut], pieces.stop[cut])
+        rows[column] = geometry
+    again = pd.DataFrame({"row": pieces.row, "element": pieces.element}).duplicated().to_numpy()
+    rows.loc[again, ["weight", "looks"]] = 0
+    return rows
+
+
+def _substrings(lines: NDArray[np.object_], start: Array, stop: Array) -> NDArray[np.object_]:
+    if len(lines) == 0:
+        return lines
+    curves = Curves(lines)
+    return curves.stretches(np.arange(len(lines)), start * curves.length, stop * curves.length)
+
+
+def _sets(table: pd.DataFrame, component: Index, count: int) -> ElementSets:
+    """Return the elements as sets of pieces; the base is the main map's piece, else the longest."""
+    position = np.arange(len(table))
+    main = table["is_main"].to_numpy(dtype=bool)
+    order = np.lexsort((position, -table["length_m"].round(6), ~main, component))
+    bounds = np.append(0, np.cumsum(np.bincount(component, minlength=count)))
+    return ElementSets(component, order[bounds[:-1]], order, bounds)
+
+
+def describe_corrections(corrections: Array) -> dict[str, Any]:
+    """Return how far the local maps were moved, ready for JSON."""
+    if len(corrections) == 0:
+        return {"shift_m_median": 0.0, "shift_m_max": 0.0, "turn_deg_max": 0.0}
+    shift = np.hypot(corrections[:, 0], corrections[:, 1])
+    return {
+        "shift_m_median": round(float(np.median(shift)), 3),
+        "shift_m_max": round(float(shift.max()), 3),
+        "turn_deg_max": round(float(np.degrees(np.abs(corrections[:, 2]).max())), 3),
+    }

@@ -1,0 +1,142 @@
+"""How often a line was seen against how often it could have been seen, and what is left of it then.
+
+The footprint says where a local map looked; how likely a predictor is to see a line there depends on where it lies from
+the vehicle, and is learned from the lines that are sure. What far fewer local maps saw than should have is left out;
+where footprints are not known nothing is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from polymerge_core.consensus.axes import Axes
+from polymerge_core.consensus.looks import Instances, Looks
+from polymerge_core.consensus.membership import points_beside
+from polymerge_core.curves import Array, Index
+
+#: What fewer than this share of the local maps saw that were expected to is left out.
+SHARE = 0.6
+
+#: Lines that so many local maps saw tell how likely one is to be seen.
+SURE = 3
+
+#: Chances are learned by squares of this many proximities, in the vehicle's frame.
+_SQUARE = 5.0
+
+#: Gaps up to this many proximities are bridged: a predictor draws one line in two pieces.
+_BRIDGED = 5
+
+#: What trimming leaves of a line must be this long, proximities.
+_SHORT = 3
+
+
+class Support(NamedTuple):
+    """How well each station is supported."""
+
+    #: Local maps that saw it.
+    seen: Index
+    #: Local maps that should have seen it; 0 where footprints are not known.
+    expected: Array
+
+
+class Stretches(NamedTuple):
+    """What is left of the lines, one entry a stretch: its line, and its first and last station."""
+
+    line: Index
+    first: Index
+    last: Index
+
+
+def support(looks: Looks, group: Index, axes: Axes) -> Support:
+    """Count who saw each station, and who should have."""
+    pairs = _sightings(looks, group, axes)
+    stations, instances = len(axes.line), len(looks.instances)
+    seen = np.bincount(pairs // instances, minlength=stations)
+    seen = axes.around(seen).astype(np.intp)
+    return Support(seen, expected_sightings(axes.stations, pairs, seen, looks.instances, _SQUARE * looks.unit))
+
+
+def expected_sightings(places: Array, pairs: Index, seen: Index, instances: Instances, square: float) -> Array:
+    """Return how many local maps should have seen each place.
+
+    Parameters
+    ----------
+    places : ndarray of float, shape (s, 2)
+        Metres.
+    pairs : ndarray of int
+        ``place * len(instances) + instance`` of every sighting; rising.
+    seen : ndarray of int, shape (s,)
+        How many saw each place.
+    instances : Instances
+        The local maps.
+    square : float
+        Side of the squares, in the vehicle's frame, by which the chance of a sighting is learned, metres.
+
+    Returns
+    -------
+    ndarray of float, shape (s,)
+        0 where footprints are not known.
+    """
+    if instances.footprint is None or len(places) == 0:
+        return np.zeros(len(places))
+    tree = shapely.STRtree(shapely.points(places))
+    instance, place = tree.query(instances.footprint, predicate="contains")
+    saw = np.isin(place * len(instances) + instance, pairs)
+    offset = places[place] - instances.position[instance]
+    sine, cosine = np.sin(instances.heading[instance]), np.cos(instances.heading[instance])
+    ahead = np.nan_to_num(cosine * offset[:, 0] + sine * offset[:, 1])
+    aside = np.nan_to_num(cosine * offset[:, 1] - sine * offset[:, 0])
+    cells = np.floor(np.column_stack([ahead, aside]) / square).astype(np.intp)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    cell = cell.ravel()
+    sure = (seen >= SURE)[place]
+    overall = saw[sure].mean() if sure.any() else saw.mean()
+    # A square that few sure lines fell into takes after the others.
+    chance = (np.bincount(cell, saw & sure) + overall) / (np.bincount(cell, sure) + 1.0)
+    return np.bincount(place, chance[cell], minlength=len(places)).astype(float)
+
+
+def _sightings(looks: Looks, group: Index, axes: Axes) -> Index:
+    """Return ``station * number of local maps + local map`` of every sighting; rising."""
+    beside = points_beside(looks, axes)
+    own = beside.line == group[looks.owner[beside.point]]
+    stations, instances = len(axes.line), len(looks.instances)
+    found = np.unique(looks.point_instance[beside.point[own]] * stations + beside.station[own])
+    # Points are as far apart as stations, so that one falls between two of them now and then.
+    skipped = found[:-1][np.diff(found) == 2] + 1
+    station = skipped % stations
+    inside = (station > 0) & (station < stations - 1)
+    station, skipped = station[inside], skipped[inside]
+    skipped = skipped[axes.line[station - 1] == axes.line[station + 1]]
+    found = np.union1d(found, skipped)
+    return np.sort((found % stations) * instances + found // stations)
+
+
+def supported_stretches(axes: Axes, support: Support) -> Stretches:
+    """Return the stretches of the lines that enough local maps saw, short gaps bridged."""
+    kept = (support.seen > 0) & (support.seen >= SHARE * np.sqrt(support.expected))
+    rows = np.flatnonzero(kept)
+    if len(rows) == 0:
+        empty = np.empty(0, np.intp)
+        return Stretches(empty, empty, empty)
+    line = axes.line[rows]
+    begins = (np.diff(line, prepend=-1) != 0) | (np.diff(rows, prepend=-1) > _BRIDGED + 1)
+    first = rows[begins]
+    last = rows[np.append(np.flatnonzero(begins)[1:], len(rows)) - 1]
+    line = axes.line[first]
+    whole = (last - first + 1) == axes.counts[line]
+    lasting = (whole | (last - first >= _SHORT)) & (last > first)
+    return Stretches(line[lasting], first[lasting], last[lasting])
+
+
+def stretch_of(stretches: Stretches, station: Index) -> NDArray[np.intp]:
+    """Return the stretch that each station is in, -1 where in none."""
+    if len(stretches.first) == 0:
+        return np.full(len(station), -1)
+    place = np.searchsorted(stretches.first, station, side="right") - 1
+    inside = (place >= 0) & (station <= stretches.last[place])
+    return np.where(inside, place, -1)
