@@ -16,6 +16,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+# Run as a file, the folder of the project is not where Python looks.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import polymerge_core as pm
 from benchmarks.noise import CLASS_NAMES
 from benchmarks.scenarios import Scenario, av2_scenarios, deecamp, held_whole, openlane, overlap, town

@@ -23,6 +23,9 @@ import geopandas as gpd
 import numpy as np
 import pandas as pd
 
+# Run as a file, the folder of the project is not where Python looks.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import polymerge_core as pm
 from benchmarks import rivals
 from benchmarks.noise import CLASS_NAMES

@@ -132,13 +132,18 @@ def _in_metres(frames: list[gpd.GeoDataFrame]) -> tuple[pyproj.CRS | None, list[
 
 def _as_lines(frame: gpd.GeoDataFrame) -> _Lines:
     """Take lines, and polygons by their rings, apart into vertices."""
-    geometry = frame.geometry.to_numpy()
     names = frame["class"].astype(str).to_numpy(object) if "class" in frame else np.full(len(frame), "line", object)
-    areal = np.isin(shapely.get_type_id(geometry), _AREAL)
-    lines = np.where(areal, shapely.boundary(geometry), geometry)
-    parts, feature = shapely.get_parts(lines, return_index=True)
+    parts, feature = line_parts(frame)
     vertices, owner = shapely.get_coordinates(parts, return_index=True)
     return _Lines(names[feature], vertices, owner, len(frame))
+
+
+def line_parts(frame: gpd.GeoDataFrame) -> tuple[NDArray[np.object_], NDArray[np.intp]]:
+    """Return a layer as single lines, polygons by their rings, and the row of each."""
+    geometry = frame.geometry.to_numpy()
+    areal = np.isin(shapely.get_type_id(geometry), _AREAL)
+    parts, feature = shapely.get_parts(np.where(areal, shapely.boundary(geometry), geometry), return_index=True)
+    return parts, feature
 
 
 def _bounds(*layers: _Lines) -> Bounds:
@@ -255,7 +260,12 @@ def _legend(figure: Figure, colours: dict[str, str], *, with_reference: bool) ->
 
 def _save(figure: Figure, path: Path) -> None:
     """Write the picture so that a crash leaves no half file."""
+    with StagedOutputs(overwrite=True) as outputs:
+        outputs.stage(path).write_bytes(png(figure))
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as a PNG file without a date or the like, so that the same figure gives the same bytes."""
     picture = BytesIO()
     figure.savefig(picture, format="png", metadata={"Software": None})
-    with StagedOutputs(overwrite=True) as outputs:
-        outputs.stage(path).write_bytes(picture.getvalue())
+    return picture.getvalue()

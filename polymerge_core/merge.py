@@ -201,7 +201,7 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
     report_progress(0.95, "writing the tables")
     elements, ids, aliases = build_elements(network.observations, sets, shapes, options)
     lineage = build_lineage(network.observations, sets, ids)
-    report = _report(network.observations, network.observations, sets, elements, options)
+    report = _report(network.observations, network.observations.left_out, sets, elements, options)
     report = _with_areas(report, network.observations, sets, options, lowered=lowered)
     report_progress(1.0, "merged")
     return MergeResult(elements, lineage, network.observations.left_out, aliases, report)
@@ -220,7 +220,7 @@ def _merge_by_consensus(local_maps: Input, main_map: Input | None, options: Opti
     pieces, sets = merged.observations, merged.sets
     elements, ids, aliases = build_elements(pieces, sets, merged.shapes, options, merged.columns)
     lineage = build_lineage(pieces, sets, ids)
-    report = _report(observations, pieces, sets, elements, options)
+    report = _report(observations, pieces.left_out, sets, elements, options)
     report["corrections"] = describe_corrections(merged.corrections)
     progress(1.0, "merged")
     return MergeResult(elements, lineage, pieces.left_out, aliases, report)
@@ -300,12 +300,12 @@ def _with_areas(
 
 def _report(
     observations: Observations,
-    pieces: Observations,
+    left_out: pd.DataFrame,
     sets: ElementSets,
     elements: gpd.GeoDataFrame,
     options: Options,
 ) -> dict[str, Any]:
-    table, left_out = observations.table, pieces.left_out
+    table = observations.table
     local = table[~table["is_main"]]
     made = elements.groupby("class")["length_m"].agg(elements="size", elements_m="sum")
     seen = local.groupby("class")["length_m"].agg(observations="size", observed_m="sum")

@@ -96,12 +96,7 @@ def column_parameters() -> list[QgsProcessingParameterDefinition]:
     """Return which columns mean what; none is needed."""
     return [
         _field("CLASS_FIELD", tr("Class column"), tr("Only features of one class are merged. Empty: class, if any.")),
-        text_parameter(
-            "CLASS_NAME",
-            tr("Class of features without one"),
-            tr("What the class of a feature is where no column names one."),
-            default="line",
-        ),
+        _class_name_parameter(),
         _field("DRIVE_FIELD", tr("Drive or survey column"), tr("Empty: drive, if any; else the layer's name.")),
         _field(
             "INSTANCE_FIELD",
@@ -125,12 +120,25 @@ def column_parameters() -> list[QgsProcessingParameterDefinition]:
             default=0.0,
         ),
         _field("TIMESTAMP_FIELD", tr("Time column"), tr("Orders the local maps. Empty: timestamp, if any.")),
-        text_parameter(
-            "AREA",
-            tr("More area classes"),
-            tr("Classes that are areas even where they come as lines, with commas between, beside ped_crossing."),
-        ),
+        _area_parameter(),
     ]
+
+
+def _class_name_parameter() -> QgsProcessingParameterString:
+    return text_parameter(
+        "CLASS_NAME",
+        tr("Class of features without one"),
+        tr("What the class of a feature is where no column names one."),
+        default="line",
+    )
+
+
+def _area_parameter() -> QgsProcessingParameterString:
+    return text_parameter(
+        "AREA",
+        tr("More area classes"),
+        tr("Classes that are areas even where they come as lines, with commas between, beside ped_crossing."),
+    )
 
 
 def crs_parameters() -> list[QgsProcessingParameterDefinition]:
@@ -267,20 +275,11 @@ def comparing_parameters() -> list[QgsProcessingParameterDefinition]:
     choices = (AUTOMATIC, "region", "observations", "footprints", "all")
     return [
         _field("CLASS_FIELD", tr("Class column"), tr("Only features of one class are compared."), layers="MERGED"),
-        text_parameter(
-            "CLASS_NAME",
-            tr("Class of features without one"),
-            tr("What the class of a feature is where no column names one."),
-            default="line",
-        ),
+        _class_name_parameter(),
         _field(
             "SCORE_FIELD", tr("Score column"), tr("Confidence from 0 to 1, for average precision."), layers="MERGED"
         ),
-        text_parameter(
-            "AREA",
-            tr("More area classes"),
-            tr("Classes that are areas even where they come as lines, with commas between, beside ped_crossing."),
-        ),
+        _area_parameter(),
         choice_parameter("REGION_FROM", tr("What counts"), text, choices),
         switch_parameter(
             "PCM",

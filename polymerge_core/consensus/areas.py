@@ -139,14 +139,15 @@ def fuse_areas(
     votes = np.bincount(counts, weight[used])
     wanted = int(np.argmax(votes))
     chosen = np.flatnonzero(counts == wanted)
+    largest = polygons[used[np.argmax(weight[used] * area[used])]]
     if len(chosen) < 2:
-        return polygons[used[np.argmax(weight[used] * area[used])]], np.nan
+        return largest, np.nan
     stack = np.array([corners[number] for number in chosen])
     aligned = _aligned(stack)
     mean, spread = _robust_mean(aligned, weight[used[chosen]])
     polygon = shapely.Polygon(mean)
     if not polygon.is_valid:  # corners of looks that have little in common
-        return polygons[used[np.argmax(weight[used] * area[used])]], np.nan
+        return largest, np.nan
     return polygon, spread / np.sqrt(len(chosen))
 
 

@@ -12,6 +12,7 @@ import heapq
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from polymerge_core.consensus.alongside import REACH, Pairs
 from polymerge_core.consensus.looks import Looks
@@ -126,12 +127,8 @@ class _Linkage:
             link = self._links[first].get(second)
             if link is not None and self._cost(first, second, link) == cost:
                 self._join(first, second)
-        for number in range(len(self._into)):
-            self._into[number] = self._root(number)
-        _, first_look, group = np.unique(self._into, return_index=True, return_inverse=True)
-        rank = np.empty(len(first_look), np.intp)
-        rank[np.argsort(first_look)] = np.arange(len(first_look))
-        return rank[group]
+        roots = np.array([self._root(number) for number in range(len(self._into))], dtype=np.intp)
+        return pd.factorize(roots)[0]
 
     def _join(self, first: int, second: int) -> None:
         if len(self._links[first]) < len(self._links[second]):

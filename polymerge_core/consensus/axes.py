@@ -151,25 +151,20 @@ class Axes:
             lengthened[ends] += (sign * moved)[:, None] * self.tangent[ends]
         return Axes(lengthened, self.line)
 
-    def smoothed(self, weight: Array, strength: float = SMOOTHING) -> Axes:
+    def smoothed(self, weight: Array) -> Axes:
         """Return the lines drawn as smoothly as their stations' weights allow.
 
         Parameters
         ----------
         weight : ndarray of float, shape (s,)
             How well each station is known; 0 where nothing was seen.
-        strength : float
-            `SMOOTHING`.
         """
         known = weight[weight > 0]
         relative = np.minimum(weight / np.median(known), _MOST) if len(known) else np.ones(len(weight))
         # A ring goes on where it ends: it is smoothed with a piece of its own to either side.
         order, series, middle = self._unrolled()
-        drawn = smooth(self.stations[order], relative[order], series, strength)[middle]
-        last = self.first + self.counts - 1
-        ring = self.curves.closed
-        drawn[last[ring]] = drawn[self.first[ring]]
-        return Axes(drawn, self.line)
+        drawn = smooth(self.stations[order], relative[order], series, SMOOTHING)[middle]
+        return Axes(self.around(drawn), self.line)
 
     def _unrolled(self) -> tuple[Index, Index, Index]:
         """Return the stations to smooth (of rings some once more), their lines, and where each station lies there."""

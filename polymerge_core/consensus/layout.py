@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_array, diags_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.sparse.linalg import spsolve
 
 from polymerge_core.consensus.alongside import Pairs
 from polymerge_core.consensus.axes import Axes
 from polymerge_core.consensus.looks import Looks
 from polymerge_core.curves import Array, Index
+from polymerge_core.network import Edges, breadth_first_depth, components
 
 #: Weight of a look's own zero against that of its pairs: enough to make the equations solvable, too little to matter.
 _ANCHOR = 1e-6
@@ -74,7 +75,6 @@ def _with_rings(looks: Looks, group: Index, axes: Axes) -> Axes:
     _, first, size = np.unique(group[order], return_index=True, return_counts=True)
     ring = order[first + size // 2]
     points, owner = curves.resampled(ring, np.zeros(len(ring)), curves.length[ring], looks.unit)
-    points[np.flatnonzero(np.diff(owner, append=-1))] = points[np.flatnonzero(np.diff(owner, prepend=-1))]
     stays = ~np.isin(axes.line, group[ring])
     line = np.concatenate([axes.line[stays], group[ring][owner]])
     rank = np.argsort(line, kind="stable")
@@ -94,40 +94,19 @@ def _senses(count: int, pairs: Pairs) -> Array:
     senses = coo_array((pairs.sense, (pairs.short, pairs.long)), shape=(count, count)).tocsr()
     chosen = tree.tocoo()
     sense = np.asarray(senses[chosen.row, chosen.col]).ravel()
-    parent, depth, edge = _rooted(count, chosen.row, chosen.col)
+    first, second = chosen.row.astype(np.intp), chosen.col.astype(np.intp)
+    edges = Edges(first, second, np.zeros(len(first)))
+    roots = np.unique(components(count, edges), return_index=True)[1]
+    depth = breadth_first_depth(count, edges, roots)
+    # In a tree each look but the root hangs from the one end of one edge.
+    hung = np.where(depth[first] > depth[second], first, second)
+    parent, of_parent = np.arange(count), np.ones(count)
+    parent[hung], of_parent[hung] = first + second - hung, sense
     found = np.ones(count)
     for level in range(1, int(depth.max(initial=0)) + 1):
         rows = np.flatnonzero(depth == level)
-        found[rows] = found[parent[rows]] * sense[edge[rows]]
+        found[rows] = found[parent[rows]] * of_parent[rows]
     return found
-
-
-def _rooted(count: int, first: Index, second: Index) -> tuple[Index, Index, Index]:
-    """Hang every tree of a forest from its first node: parent, depth and the edge to the parent of each node."""
-    parent, depth, edge = np.full(count, -1), np.zeros(count, np.intp), np.full(count, -1)
-    if len(first) == 0:
-        return parent, depth, edge
-    # One root above all trees makes one tree of the forest, which is walked through once.
-    members = coo_array((np.ones(len(first)), (first, second)), shape=(count + 1, count + 1)).tocsr()
-    roots = _first_of_each_tree(count, first, second)
-    above = coo_array((np.ones(len(roots)), (np.full(len(roots), count), roots)), shape=(count + 1, count + 1))
-    order, before = breadth_first_order((members + above.tocsr()).tocsr(), count, directed=False)
-    parent = before[:count].astype(np.intp)
-    parent[parent == count] = -1
-    for node in order[1:].tolist():
-        depth[node] = 0 if parent[node] < 0 else depth[parent[node]] + 1
-    hung = np.flatnonzero(parent >= 0)
-    key = np.minimum(first, second) * count + np.maximum(first, second)
-    rank = np.argsort(key)
-    wanted = np.minimum(hung, parent[hung]) * count + np.maximum(hung, parent[hung])
-    edge[hung] = rank[np.searchsorted(key[rank], wanted)]
-    return parent, depth, edge
-
-
-def _first_of_each_tree(count: int, first: Index, second: Index) -> Index:
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
-    _, tree = connected_components(graph, directed=False)
-    return np.unique(tree, return_index=True)[1]
 
 
 def _beginnings(count: int, pairs: Pairs, sense: Array) -> Array:

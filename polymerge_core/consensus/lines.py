@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import shapely
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -52,10 +53,6 @@ class Lines(NamedTuple):
     seen, expected : ndarray of float, shape (m,)
         How many local maps saw a place of each, in the mean, and how many should have; expected is 0 where footprints
         are not known.
-    owner : ndarray of int, shape (p,)
-        The look of each point of the looks.
-    arc : ndarray of float, shape (p,)
-        Where each point lies along its look, metres.
     element : ndarray of int, shape (p,)
         The merged line that each point went into; -1 where it was left out.
     """
@@ -64,8 +61,6 @@ class Lines(NamedTuple):
     sigma: Array
     seen: Array
     expected: Array
-    owner: Index
-    arc: Array
     element: Index
 
 
@@ -188,10 +183,7 @@ def _connected(looks: Looks, pairs: Pairs, group: Index) -> Index:
     own = (group[pairs.short] == group[pairs.long]) & (pairs.overlap > 0)
     joined = (np.ones(int(own.sum())), (pairs.short[own], pairs.long[own]))
     _, part = connected_components(coo_array(joined, shape=(len(looks), len(looks))), directed=False)
-    _, first, inverse = np.unique(part, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.intp)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[inverse]
+    return pd.factorize(part)[0]
 
 
 def _finish(state: _State) -> Lines:
@@ -201,7 +193,7 @@ def _finish(state: _State) -> Lines:
     stretches = supported_stretches(fit.axes, found)
     shapes = _shapes(fit.axes.stations, stretches, _TOLERANCE * looks.unit)
     element = stretch_of(stretches, fit.feet.station)
-    return Lines(shapes, *_means(found, fit.error, stretches), looks.owner, looks.arc, element)
+    return Lines(shapes, *_means(found, fit.error, stretches), element)
 
 
 def _shapes(stations: Array, stretches: Stretches, tolerance: float) -> NDArray[np.object_]:
@@ -217,11 +209,10 @@ def _shapes(stations: Array, stretches: Stretches, tolerance: float) -> NDArray[
 
 def _means(found: Support, error: Array, stretches: Stretches) -> tuple[Array, Array, Array]:
     """Return the median standard error and the mean support of each stretch."""
-    count = len(stretches.first)
-    sigma = np.full(count, np.nan)
+    stretch = stretch_of(stretches, np.arange(len(error)))
+    inside = stretch >= 0
+    sigma = pd.Series(error[inside]).groupby(stretch[inside]).median().to_numpy()
     totals = [np.concatenate([[0.0], np.cumsum(values)]) for values in (found.seen, found.expected)]
     size = stretches.last - stretches.first + 1
     seen, expected = ((total[stretches.last + 1] - total[stretches.first]) / size for total in totals)
-    for number, (first, last) in enumerate(zip(stretches.first.tolist(), stretches.last.tolist(), strict=True)):
-        sigma[number] = np.median(error[first : last + 1])
     return sigma, seen, expected

@@ -54,12 +54,12 @@ def points_beside(looks: Looks, axes: Axes) -> Beside:
     return Beside(point[nearest], station[nearest], line[nearest], lateral[nearest])
 
 
-def seen_by(looks: Looks, group: Index, beside: Beside, stations: int) -> Index:
-    """Count the local maps whose looks at a line run beside each of its stations."""
+def sightings(looks: Looks, group: Index, beside: Beside) -> tuple[Index, Index]:
+    """Return the stations of the lines and the local maps whose looks at that line run beside them, each pair once."""
     own = beside.line == group[looks.owner[beside.point]]
     instances = len(looks.instances)
     pairs = np.unique(beside.station[own] * instances + looks.point_instance[beside.point[own]])
-    return np.bincount(pairs // instances, minlength=stations)
+    return pairs // instances, pairs % instances
 
 
 def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
@@ -79,10 +79,10 @@ def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
     Returns
     -------
     ndarray of int, shape (n,)
-        The line of each look, numbered anew from 0.
+        The line of each look.
     """
     beside = points_beside(looks, axes)
-    seen = seen_by(looks, group, beside, len(axes.line))
+    seen = np.bincount(sightings(looks, group, beside)[0], minlength=len(axes.line))
     owner = looks.owner[beside.point]
     own = beside.line == group[owner]
     others = np.clip(seen[beside.station] - own, 0, _ENOUGH) / _ENOUGH
@@ -100,4 +100,4 @@ def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
     best = best[total[best] > 0]
     settled = group.copy()
     settled[look[best]] = line[best]
-    return np.unique(settled, return_inverse=True)[1]
+    return settled

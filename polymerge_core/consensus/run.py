@@ -184,14 +184,14 @@ def _known(frame: gpd.GeoDataFrame, crs: pyproj.CRS) -> pd.DataFrame:
 
 def _pieces_of_lines(rows: Index, lines: Lines, looks: Looks, first: int, shortest: float) -> _Pieces:
     """Cut observations where their points went into another element, or into none."""
-    owner, element = lines.owner, _steady(lines, looks, shortest)
+    owner, arc, element = looks.owner, looks.arc, _steady(lines, looks, shortest)
     begins = (np.diff(owner, prepend=-1) != 0) | (np.diff(element, prepend=-2) != 0)
     run = np.flatnonzero(begins)
     length = looks.curves.length[owner[run]]
     # Halfway between the last point of one piece and the first of the next.
-    before = np.where(run > 0, lines.arc[run - 1], 0.0)
+    before = np.where(run > 0, arc[run - 1], 0.0)
     opens = np.diff(owner[run], prepend=-1) != 0
-    start = np.where(opens, 0.0, (before + lines.arc[run]) / 2)
+    start = np.where(opens, 0.0, (before + arc[run]) / 2)
     stop = np.append(start[1:], 0.0)
     last = np.append(opens[1:], [True])
     number = element[run]
@@ -201,7 +201,7 @@ def _pieces_of_lines(rows: Index, lines: Lines, looks: Looks, first: int, shorte
 
 def _steady(lines: Lines, looks: Looks, shortest: float) -> Index:
     """Give pieces too short to be told apart to the piece before them, or after, of the same observation."""
-    owner, element = lines.owner, lines.element.copy()
+    owner, element = looks.owner, lines.element
     for _ in range(3):
         begins = np.flatnonzero((np.diff(owner, prepend=-1) != 0) | (np.diff(element, prepend=-2) != 0))
         size = np.diff(np.append(begins, len(owner)))

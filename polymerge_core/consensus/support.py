@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polymerge_core.consensus.axes import Axes
 from polymerge_core.consensus.looks import Instances, Looks
-from polymerge_core.consensus.membership import points_beside
+from polymerge_core.consensus.membership import points_beside, sightings
 from polymerge_core.curves import Array, Index
 
 #: What fewer than this share of the local maps saw that were expected to is left out.
@@ -44,9 +44,8 @@ class Support(NamedTuple):
 
 
 class Stretches(NamedTuple):
-    """What is left of the lines, one entry a stretch: its line, and its first and last station."""
+    """What is left of the lines, one entry a stretch: its first and its last station."""
 
-    line: Index
     first: Index
     last: Index
 
@@ -102,10 +101,9 @@ def expected_sightings(places: Array, pairs: Index, seen: Index, instances: Inst
 
 def _sightings(looks: Looks, group: Index, axes: Axes) -> Index:
     """Return ``station * number of local maps + local map`` of every sighting; rising."""
-    beside = points_beside(looks, axes)
-    own = beside.line == group[looks.owner[beside.point]]
     stations, instances = len(axes.line), len(looks.instances)
-    found = np.unique(looks.point_instance[beside.point[own]] * stations + beside.station[own])
+    station, instance = sightings(looks, group, points_beside(looks, axes))
+    found = np.sort(instance * stations + station)
     # Points are as far apart as stations, so that one falls between two of them now and then.
     skipped = found[:-1][np.diff(found) == 2] + 1
     station = skipped % stations
@@ -122,15 +120,14 @@ def supported_stretches(axes: Axes, support: Support) -> Stretches:
     rows = np.flatnonzero(kept)
     if len(rows) == 0:
         empty = np.empty(0, np.intp)
-        return Stretches(empty, empty, empty)
+        return Stretches(empty, empty)
     line = axes.line[rows]
     begins = (np.diff(line, prepend=-1) != 0) | (np.diff(rows, prepend=-1) > _BRIDGED + 1)
     first = rows[begins]
     last = rows[np.append(np.flatnonzero(begins)[1:], len(rows)) - 1]
-    line = axes.line[first]
-    whole = (last - first + 1) == axes.counts[line]
+    whole = (last - first + 1) == axes.counts[axes.line[first]]
     lasting = (whole | (last - first >= _SHORT)) & (last > first)
-    return Stretches(line[lasting], first[lasting], last[lasting])
+    return Stretches(first[lasting], last[lasting])
 
 
 def stretch_of(stretches: Stretches, station: Index) -> NDArray[np.intp]:

@@ -5,8 +5,6 @@ Each is a PNG as bytes, made without pyplot and without a date, so that the same
 
 from __future__ import annotations
 
-from io import BytesIO
-
 import geopandas as gpd
 import numpy as np
 import shapely
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 
 from polymerge_core.crs import Bounds
 from polymerge_core.evaluation.lengths import LATERAL_M
+from polymerge_core.figures import line_parts, png
 
 _DPI = 110
 _WIDTH_IN = 11.0
@@ -46,7 +45,7 @@ def map_picture(panels: dict[str, gpd.GeoDataFrame], reference: gpd.GeoDataFrame
         _frame(panel, view, title)
         _draw(panel, reference, _REFERENCE, 3.0, 0.7)
         _draw(panel, frame, _DRAWN, 1.1, 0.9 if len(frame) < 200 else 0.4)
-    return _png(figure)
+    return png(figure)
 
 
 def error_picture(errors: gpd.GeoDataFrame, reference: gpd.GeoDataFrame, view: Bounds) -> bytes:
@@ -62,7 +61,7 @@ def error_picture(errors: gpd.GeoDataFrame, reference: gpd.GeoDataFrame, view: B
     panel.add_collection(lines, autolim=False)
     bar = figure.colorbar(lines, ax=panel, shrink=0.8, pad=0.01)
     bar.set_label(f"metres; orange: more than {LATERAL_M:g} m, or no reference")
-    return _png(figure)
+    return png(figure)
 
 
 def histogram_picture(error: NDArray[np.float64]) -> bytes:
@@ -77,7 +76,7 @@ def histogram_picture(error: NDArray[np.float64]) -> bytes:
     panel.legend(frameon=False)
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)
-    return _png(figure)
+    return png(figure)
 
 
 def _figure(count: int, view: Bounds) -> tuple[Figure, list[Axes]]:
@@ -101,14 +100,5 @@ def _draw(panel: Axes, frame: gpd.GeoDataFrame, colour: str, width: float, alpha
 
 def _segments(frame: gpd.GeoDataFrame) -> list[NDArray[np.float64]]:
     """Return the vertices of each line, and of the rings of areas."""
-    shapes = frame.geometry.to_numpy()
-    areal = shapely.get_dimensions(shapes) == 2
-    parts = shapely.get_parts(np.where(areal, shapely.boundary(shapes), shapes))
-    vertices, owner = shapely.get_coordinates(parts, return_index=True)
+    vertices, owner = shapely.get_coordinates(line_parts(frame)[0], return_index=True)
     return np.split(vertices, np.flatnonzero(np.diff(owner)) + 1) if len(vertices) else []
-
-
-def _png(figure: Figure) -> bytes:
-    picture = BytesIO()
-    figure.savefig(picture, format="png", metadata={"Software": None})
-    return picture.getvalue()

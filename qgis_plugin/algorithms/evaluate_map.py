@@ -141,11 +141,8 @@ class EvaluateMap(WorkerAlgorithm):
         declared = self.parameterAsCrs(parameters, "CRS", context).isValid()
         plain = self.parameterAsBoolean(parameters, "LOCAL_CRS", context)
         known = super().fault(parameters, context) or crs_contradiction(declared=declared, plain=plain)
-        for role in _ROLES:
-            if known:
-                break
-            known = self._role_fault(role, parameters, context, has_crs=declared or plain)
-        return known
+        faults = (self._role_fault(role, parameters, context, has_crs=declared or plain) for role in _ROLES)
+        return known or next(filter(None, faults), "")
 
     def _role_fault(self, role: str, parameters: Parameters, context: QgsProcessingContext, *, has_crs: bool) -> str:
         layers, given = self._layers(role, parameters, context), parameters.get(role)
