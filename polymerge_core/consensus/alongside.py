@@ -33,6 +33,8 @@ class Pairs(NamedTuple):
     #: Over how much of the shorter one they run alongside, and over how much they run apart, metres.
     overlap: Array
     apart: Array
+    #: Over how much of it they run in one direction, alongside or apart, metres.
+    parallel: Array
     #: Mean square of their lateral distance where they run alongside, square metres.
     square: Array
     #: 1 where both were digitised in the same direction, -1 where not.
@@ -95,6 +97,7 @@ def pairs_alongside(looks: Looks, kind: Index) -> Pairs:
         long,
         total(beside) * step,
         total(~beside & ~beyond) * step,
+        total(straight & ~beyond) * step,
         total(np.where(beside, lateral**2, 0.0)) / seen,
         sense,
         total(np.where(beside, foot - sense[pair] * position, 0.0)) / seen,

@@ -45,7 +45,7 @@ def associate(looks: Looks, pairs: Pairs) -> Index:
     The limit is one proximity. Where the footprints say that both local maps looked at the place, and neither saw two
     lines, it rises to `REACH` proximities: that two lines were never seen together is evidence that they are one.
     """
-    same = (looks.instance[pairs.short] == looks.instance[pairs.long]) & (pairs.overlap > 0)
+    same = (looks.instance[pairs.short] == looks.instance[pairs.long]) & (pairs.parallel > 0)
     reach = REACH * looks.unit
     square = np.where(same, 0.0, pairs.overlap * pairs.square + pairs.apart * reach**2)
     metres = np.where(same, 0.0, pairs.overlap + pairs.apart)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polymerge_core.consensus.alongside import ANGLE_DEG, REACH
@@ -90,7 +91,10 @@ def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
     of_line = np.zeros(int(axes.line.max(initial=0)) + 1, np.intp)
     of_line[group] = kind
     alike = of_line[beside.line] == kind[owner]
-    agrees = alike * (1 - (beside.lateral / limit) ** 2) * others * looks.metres[beside.point]
+    agreement = (1 - (beside.lateral / limit) ** 2) * others
+    # What its local map saw of the line in another look is not what it shows.
+    agreement = np.where(_taken(looks, beside, own), -1.0, agreement)
+    agrees = alike * agreement * looks.metres[beside.point]
     lines = len(of_line)
     key, place = np.unique(owner * lines + beside.line, return_inverse=True)
     total = np.bincount(place, agrees)
@@ -101,3 +105,14 @@ def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
     settled = group.copy()
     settled[look[best]] = line[best]
     return settled
+
+
+def _taken(looks: Looks, beside: Beside, own: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell where a look runs beside a line that another look of its local map, which is of that line, shows there."""
+    owner = looks.owner[beside.point]
+    place = beside.station * len(looks.instances) + looks.instance[owner]
+    step = len(looks.instances)
+    # Points are as far apart as stations, so that a neighbour may be the one that the other look has.
+    near = np.concatenate([place[own] + shift * step for shift in (-1, 0, 1)])
+    there = np.unique(near)
+    return ~own & np.isin(place, there)
