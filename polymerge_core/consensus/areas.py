@@ -10,10 +10,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
 from polymerge_core.consensus.association import Links, link_groups
+from polymerge_core.consensus.fusion import HALF_WEIGHT
 from polymerge_core.consensus.looks import Instances
 from polymerge_core.consensus.support import SHARE, expected_sightings
 from polymerge_core.curves import Array, Index
@@ -21,14 +23,20 @@ from polymerge_core.curves import Array, Index
 #: Looks belong together where they have this share of the smaller one in common, in the mean.
 OVERLAP = 0.5
 
+#: What is left of one that was cut off may lie so many proximities beside the area: it may be narrower than errors are.
+_BESIDE = 0.5
+
 #: A corner that leaves the outline where it is within this many proximities is none.
 _STRAIGHT = 0.15
 
 #: A look that comes so near to the edge of what its local map looked at may have been cut off there, proximities.
 _EDGE = 0.5
 
-#: The largest looks, down to this share of the largest, are taken where none is held whole.
-_LARGE = 0.8
+#: Corners of two looks so many proximities apart may be the same.
+_SAME_CORNER = 2.0
+
+#: Median distance to standard deviation along each axis, for normal errors in the plane.
+_RAYLEIGH = 1.1774
 
 #: Squares by which chances of a sighting are learned, proximities.
 _SQUARE = 5.0
@@ -79,11 +87,12 @@ def merge_looks_at_areas(
     Areas
         In the order of their first looks.
     """
-    group = group_areas(polygons, instance)
+    edges = _edges(instance, instances)
     whole = held_whole(polygons, instance, instances, unit)
+    group = group_areas(polygons, instance, whole, unit)
     order = np.argsort(group, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
-    fused = [fuse_areas(polygons[rows], weight[rows], whole[rows], unit) for rows in members]
+    fused = [fuse_areas(polygons[row], weight[row], None if edges is None else edges[row], unit) for row in members]
     shapes = np.array([shape for shape, _ in fused], dtype=object)
     sigma = np.array([error for _, error in fused])
     pairs = np.unique(group * len(instances) + instance)
@@ -95,8 +104,14 @@ def merge_looks_at_areas(
     return Areas(shapes[kept], sigma[kept], seen[kept].astype(float), expected[kept], number[group])
 
 
-def group_areas(polygons: NDArray[np.object_], instance: Index) -> Index:
-    """Group looks at the same area, numbered from 0 in the order of their first looks."""
+def group_areas(
+    polygons: NDArray[np.object_], instance: Index, whole: NDArray[np.bool_], unit: float
+) -> Index:
+    """Group looks at the same area, numbered from 0 in the order of their first looks.
+
+    Looks that hold their area whole say which areas there are. One that was cut off has a share of any of them that
+    it reaches into: it joins the one that it has most in common with; those that join none are grouped by themselves.
+    """
     first, second = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     once = first < second
     first, second = first[once], second[once]
@@ -107,48 +122,119 @@ def group_areas(polygons: NDArray[np.object_], instance: Index) -> Index:
     # As with lines, a cost over a length: how little they have in common, against how little they may.
     cost = np.where(same, 0.0, (1.0 - share) / (1.0 - OVERLAP))
     links = Links(first, second, cost, np.where(same, 0.0, 1.0), np.zeros(len(first)), same.astype(float))
-    return link_groups(instance, links, 1.0)
+    alike = whole[first] == whole[second]
+    group = link_groups(instance, links.take(alike), 1.0)
+    joined = _join_cut(polygons, links.take(~alike), group, whole, unit)
+    return np.asarray(pd.factorize(joined)[0], dtype=np.intp)
+
+
+def _join_cut(
+    polygons: NDArray[np.object_], links: Links, group: Index, whole: NDArray[np.bool_], unit: float
+) -> Index:
+    """Return the groups with looks that were cut off in those of whole looks that they have most in common with."""
+    cut = np.where(whole[links.first], links.second, links.first)
+    other = links.first + links.second - cut
+    onto = group[other]
+    near = shapely.buffer(polygons[other], _BESIDE * unit, join_style="mitre")
+    share = shapely.area(shapely.intersection(polygons[cut], near)) / shapely.area(polygons[cut])
+    table = pd.DataFrame({"cut": cut, "onto": onto, "share": share, "same": links.side_by_side})
+    # In the mean of the looks of a group; what one local map saw beside one of them is not of that group.
+    means = table.groupby(["cut", "onto"], sort=True).agg({"share": "sum", "same": "max"}).reset_index()
+    means["share"] /= np.bincount(group)[means["onto"]]
+    means = means[(means["share"] >= OVERLAP) & (means["same"] == 0)]
+    best = means.sort_values("share", ascending=False, kind="stable").drop_duplicates("cut")
+    joined = group.copy()
+    joined[best["cut"]] = best["onto"]
+    return joined
 
 
 def held_whole(polygons: NDArray[np.object_], instance: Index, instances: Instances, unit: float) -> NDArray[np.bool_]:
     """Tell which looks do not end at the edge of what their local map looked at; all where that is not known."""
-    if instances.footprint is None:
+    edges = _edges(instance, instances)
+    if edges is None:
         return np.ones(len(polygons), dtype=bool)
-    edges = shapely.boundary(instances.footprint[instance])
     return np.asarray(shapely.distance(edges, polygons) > _EDGE * unit)
 
 
+def _edges(instance: Index, instances: Instances) -> NDArray[np.object_] | None:
+    """Return the edge of what the local map of each look looked at."""
+    return None if instances.footprint is None else shapely.boundary(instances.footprint[instance])
+
+
 def fuse_areas(
-    polygons: NDArray[np.object_], weight: Array, whole: NDArray[np.bool_], unit: float
+    polygons: NDArray[np.object_], weight: Array, edges: NDArray[np.object_] | None, unit: float
 ) -> tuple[shapely.Polygon, float]:
     """Merge the looks at one area.
+
+    Parameters
+    ----------
+    polygons : ndarray of Polygon, shape (n,)
+        Metres.
+    weight : ndarray of float, shape (n,)
+        How much each counts.
+    edges : ndarray of LineString, shape (n,), optional
+        Edge of what the local map of each looked at: what lies there is no corner.
+    unit : float
+        The proximity, metres.
 
     Returns
     -------
     polygon : Polygon
-        With the number of corners that most looks have.
+        With the number of corners that most looks have that hold the area whole, or those of the largest look.
     error : float
         Standard error of a corner, metres; NaN for a single look.
     """
     if len(polygons) == 1:
         return polygons[0], np.nan
-    area = shapely.area(polygons)
-    used = np.flatnonzero(whole) if whole.any() else np.flatnonzero(area >= _LARGE * area.max())
-    corners = [_corners(polygon, unit) for polygon in polygons[used]]
-    counts = np.array([len(each) for each in corners])
-    votes = np.bincount(counts, weight[used])
-    wanted = int(np.argmax(votes))
-    chosen = np.flatnonzero(counts == wanted)
-    largest = polygons[used[np.argmax(weight[used] * area[used])]]
-    if len(chosen) < 2:
-        return largest, np.nan
-    stack = np.array([corners[number] for number in chosen])
-    aligned = _aligned(stack)
-    mean, spread = _robust_mean(aligned, weight[used[chosen]])
+    corners = [_corners(polygon, unit) for polygon in polygons]
+    true = [np.ones(len(each), bool) for each in corners]
+    if edges is not None:
+        true = [
+            shapely.distance(edge, shapely.points(each)) > _EDGE * unit
+            for edge, each in zip(edges, corners, strict=True)
+        ]
+    whole = np.array([each.all() for each in true])
+    outline, cut = _outline(polygons, corners, true, weight, whole)
+    seen = np.full((len(corners), len(outline), 2), np.nan)
+    for row, (each, known) in enumerate(zip(corners, true, strict=True)):
+        _put_corners(seen[row], outline, each[known], _SAME_CORNER * unit)
+    mean, error = _robust_mean(seen, weight)
+    known = np.isfinite(mean[:, 0]) & ~cut
+    if not known.any():
+        return shapely.Polygon(outline), np.nan
+    # Where all looks were cut off, the outline goes along with the corners that are known.
+    mean = np.where(known[:, None], mean, outline + (mean - outline)[known].mean(axis=0))
     polygon = shapely.Polygon(mean)
-    if not polygon.is_valid:  # corners of looks that have little in common
-        return largest, np.nan
-    return polygon, spread / np.sqrt(len(chosen))
+    # Corners of looks that have little in common may cross over.
+    return (polygon, error) if polygon.is_valid else (shapely.Polygon(outline), np.nan)
+
+
+def _outline(
+    polygons: NDArray[np.object_],
+    corners: list[Array],
+    true: list[NDArray[np.bool_]],
+    weight: Array,
+    whole: NDArray[np.bool_],
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the corners to begin with, and which of them are none: those of the largest of the usual looks."""
+    counts = np.array([len(each) for each in corners])
+    usual = np.flatnonzero(whole)
+    if len(usual):
+        usual = usual[counts[usual] == np.argmax(np.bincount(counts[usual], weight[usual]))]
+        stack = np.array([corners[number] for number in usual])
+        return _aligned(stack).mean(axis=0), np.zeros(stack.shape[1], bool)
+    largest = int(np.argmax(shapely.area(polygons)))
+    return corners[largest], ~true[largest]
+
+
+def _put_corners(row: Array, outline: Array, corners: Array, far: float) -> None:
+    """Put corners of a look where the nearest corner of the outline is, if each is the other's nearest."""
+    if len(corners) == 0:
+        return
+    distance = np.hypot(*(corners[:, None] - outline[None]).T).T
+    nearest = distance.argmin(axis=1)
+    mutual = (distance.argmin(axis=0)[nearest] == np.arange(len(corners))) & (distance.min(axis=1) <= far)
+    row[nearest[mutual]] = corners[mutual]
 
 
 def _corners(polygon: shapely.Polygon, unit: float) -> Array:
@@ -172,13 +258,28 @@ def _aligned(stack: Array) -> Array:
     return np.asarray(turns[turn, np.arange(len(stack))])
 
 
-def _robust_mean(stack: Array, weight: Array) -> tuple[Array, float]:
-    """Return the mean of rings corner by corner, looks that are far off counting less, and their spread, metres."""
-    mean = np.median(stack, axis=0)
-    spread = 0.0
-    for _ in range(5):
-        off = np.hypot(*np.moveaxis(stack - mean, -1, 0))
-        spread = max(float(np.median(off)) / 1.1774, 1e-6)  # of a normal error in the plane
-        robust = weight[:, None] / (1 + (off / (2 * spread)) ** 2)
-        mean = (robust[..., None] * stack).sum(axis=0) / robust.sum(axis=0)[:, None]
-    return mean, spread
+def _robust_mean(seen: Array, weight: Array) -> tuple[Array, float]:
+    """Return the mean of looks corner by corner, those that are far off counting less, and its standard error, metres.
+
+    Parameters
+    ----------
+    seen : ndarray of float, shape (n, c, 2)
+        Corners; NaN where a look does not have one.
+    weight : ndarray of float, shape (n,)
+        How much each look counts.
+    """
+    there = np.isfinite(seen[..., 0])
+    held = np.where(there[..., None], seen, 0.0)
+    corners = zip(seen.swapaxes(0, 1), there.T, strict=True)
+    # A corner that nobody saw has no mean.
+    mean = np.array([np.median(each[known], axis=0) if known.any() else [np.nan] * 2 for each, known in corners])
+    spread = 1e-6
+    for _ in range(5 if there.any() else 0):
+        off = np.hypot(*np.moveaxis(np.where(there[..., None], seen - mean, 0.0), -1, 0))
+        spread = max(float(np.median(off[there])) / _RAYLEIGH, 1e-6)
+        robust = np.where(there, weight[:, None] / (1 + (off / (HALF_WEIGHT * spread)) ** 2), 0.0)
+        total = robust.sum(axis=0)[:, None]
+        mean = np.where(total > 0, (robust[..., None] * held).sum(axis=0) / np.where(total > 0, total, 1.0), np.nan)
+    looks = there.sum(axis=0)
+    several = looks[looks > 1]
+    return mean, spread / float(np.sqrt(several.mean())) if len(several) else np.nan

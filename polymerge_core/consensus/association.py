@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from polymerge_core.consensus.alongside import REACH, Pairs
 from polymerge_core.consensus.looks import Looks
@@ -66,6 +67,10 @@ class Links(NamedTuple):
     covisible: Array
     #: 1 where one local map saw both, side by side.
     side_by_side: Array
+
+    def take(self, rows: NDArray[np.bool_]) -> Links:
+        """Return some of the links."""
+        return Links._make(column[rows] for column in self)
 
 
 def link_groups(instance: Index, links: Links, unit: float) -> Index:

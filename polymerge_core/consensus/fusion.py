@@ -22,8 +22,8 @@ from polymerge_core.curves import Array, Index
 #: The errors along a look are alike over this many proximities, so that it counts as one measurement over each of them.
 CORRELATION = 10.0
 
-#: A residual of so many standard deviations counts half.
-_HALF_WEIGHT = 2.0
+#: A residual of so many standard deviations counts half: for normal errors a mean weighted so is 95 % efficient.
+HALF_WEIGHT = 2.385
 
 #: Median absolute deviation to standard deviation, for normal errors.
 _MAD = 1.4826
@@ -127,7 +127,7 @@ def _offsets(looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, co
     drives = int(drive.max(initial=0)) + 1
     cell, place = np.unique(station * drives + drive, return_inverse=True)
     information = looks.weight[looks.owner[rows]] * looks.metres[rows] / looks.unit / sigma**2
-    middle, scale = np.zeros(count), _HALF_WEIGHT * sigma
+    middle, scale = np.zeros(count), HALF_WEIGHT * sigma
     offset = weight = middle
     for _ in range(3):
         robust = information / (1 + ((lateral - middle[station]) / scale) ** 2)
@@ -135,7 +135,7 @@ def _offsets(looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, co
         said = np.bincount(place, robust * lateral) / np.maximum(total, np.finfo(float).tiny)
         sure = 1.0 / (noise.drive_sigma**2 + 1.0 / np.maximum(total, np.finfo(float).tiny))
         if noise.drive_sigma > 0:
-            sure /= 1 + ((said - middle[cell // drives]) / (_HALF_WEIGHT * 2 * noise.drive_sigma)) ** 2
+            sure /= 1 + ((said - middle[cell // drives]) / (HALF_WEIGHT * 2 * noise.drive_sigma)) ** 2
         weight = np.bincount(cell // drives, sure, minlength=count).astype(float)
         offset = np.bincount(cell // drives, sure * said, minlength=count) / np.maximum(weight, np.finfo(float).tiny)
         middle = offset

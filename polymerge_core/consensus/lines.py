@@ -35,7 +35,7 @@ _ROUNDS = 3
 _DRIVES = 2
 
 #: How often the local maps are corrected, and the lines fitted anew.
-_CORRECTIONS = 4
+_CORRECTIONS = 2
 
 #: Vertices that leave the line where it is within this share of a proximity are left out of it.
 _TOLERANCE = 0.005
