@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from polymerge_core.consensus.association import Links, link_groups
 from polymerge_core.consensus.fusion import HALF_WEIGHT
 from polymerge_core.consensus.looks import Instances
-from polymerge_core.consensus.support import SHARE, expected_sightings
+from polymerge_core.consensus.support import enough, expected_sightings
 from polymerge_core.curves import Array, Index
 
 #: Looks belong together where they have this share of the smaller one in common, in the mean.
@@ -99,7 +99,7 @@ def merge_looks_at_areas(
     seen = np.bincount(pairs // len(instances), minlength=len(shapes))
     places = shapely.get_coordinates(shapely.centroid(shapes))
     expected = expected_sightings(places, pairs, seen, instances, _SQUARE * unit)
-    kept = seen >= SHARE * np.sqrt(expected)
+    kept = enough(seen, expected)
     number = np.where(kept, np.cumsum(kept) - 1, -1)
     return Areas(shapes[kept], sigma[kept], seen[kept].astype(float), expected[kept], number[group])
 
@@ -123,7 +123,7 @@ def group_areas(
     cost = np.where(same, 0.0, (1.0 - share) / (1.0 - OVERLAP))
     links = Links(first, second, cost, np.where(same, 0.0, 1.0), np.zeros(len(first)), same.astype(float))
     alike = whole[first] == whole[second]
-    group = link_groups(instance, links.take(alike), 1.0)
+    group = link_groups(np.ones(len(polygons)), links.take(alike), 1.0)
     joined = _join_cut(polygons, links.take(~alike), group, whole, unit)
     return np.asarray(pd.factorize(joined)[0], dtype=np.intp)
 

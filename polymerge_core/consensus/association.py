@@ -3,7 +3,7 @@
 Looks that run closest together are put together first, and groups go on being put together while the root mean square
 distance between their looks is below a limit. Two lines that one local map saw side by side are different lines
 (cannot-link; Wagstaff et al. 2001, "Constrained k-means clustering with background knowledge"): groups are kept apart
-where more than a few local maps saw both.
+where local maps saw both over most of the smaller one.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from polymerge_core.consensus.alongside import REACH, Pairs
 from polymerge_core.consensus.looks import Looks
 from polymerge_core.curves import Array, Index
 
-#: Groups that more than this share of the local maps of the smaller one saw side by side are different lines. In fewer
-#: a predictor draws a line twice, or invents one beside it.
-SIDE_BY_SIDE = 0.2
+#: Groups that single local maps saw side by side over more than this share of the smaller one are different lines. Over
+#: less of it a predictor draws a line twice, or invents one beside it.
+SIDE_BY_SIDE = 0.4
 
 _Link = tuple[float, float, float, float]
 
@@ -47,12 +47,13 @@ def associate(looks: Looks, pairs: Pairs) -> Index:
     lines, it rises to `REACH` proximities: that two lines were never seen together is evidence that they are one.
     """
     same = (looks.instance[pairs.short] == looks.instance[pairs.long]) & (pairs.parallel > 0)
+    side_by_side = np.where(same, pairs.overlap + pairs.apart, 0.0)
     reach = REACH * looks.unit
     square = np.where(same, 0.0, pairs.overlap * pairs.square + pairs.apart * reach**2)
     metres = np.where(same, 0.0, pairs.overlap + pairs.apart)
     covisible = np.where(same, 0.0, pairs.covisible * pairs.overlap)
-    links = Links(pairs.short, pairs.long, square, metres, covisible, same.astype(float))
-    return link_groups(looks.instance, links, looks.unit)
+    links = Links(pairs.short, pairs.long, square, metres, covisible, side_by_side)
+    return link_groups(looks.curves.length, links, looks.unit)
 
 
 class Links(NamedTuple):
@@ -65,7 +66,7 @@ class Links(NamedTuple):
     metres: Array
     #: Length of it that both local maps looked at.
     covisible: Array
-    #: 1 where one local map saw both, side by side.
+    #: Length over which one local map saw both, side by side.
     side_by_side: Array
 
     def take(self, rows: NDArray[np.bool_]) -> Links:
@@ -73,13 +74,13 @@ class Links(NamedTuple):
         return Links._make(column[rows] for column in self)
 
 
-def link_groups(instance: Index, links: Links, unit: float) -> Index:
+def link_groups(size: Array, links: Links, unit: float) -> Index:
     """Put together what is closest, until nothing is close enough.
 
     Parameters
     ----------
-    instance : ndarray of int, shape (n,)
-        The local map of each look.
+    size : ndarray of float, shape (n,)
+        Length of each look.
     links : Links
         Pairs of looks.
     unit : float
@@ -90,7 +91,7 @@ def link_groups(instance: Index, links: Links, unit: float) -> Index:
     ndarray of int, shape (n,)
         The group of each look, numbered from 0 in the order of their first looks.
     """
-    linkage = _Linkage(instance.tolist(), unit)
+    linkage = _Linkage(size.tolist(), unit)
     values = zip(*(column.tolist() for column in links[2:]), strict=True)
     for first, second, link in zip(links.first.tolist(), links.second.tolist(), values, strict=True):
         linkage.link(first, second, link)
@@ -100,10 +101,10 @@ def link_groups(instance: Index, links: Links, unit: float) -> Index:
 class _Linkage:
     """Groups of looks, the links between them, and which two are to be put together next."""
 
-    def __init__(self, instance: list[int], unit: float) -> None:
-        self._seen_by: list[set[int] | None] = [{each} for each in instance]
-        self._links: list[dict[int, _Link]] = [{} for _ in instance]
-        self._into = list(range(len(instance)))
+    def __init__(self, size: list[float], unit: float) -> None:
+        self._size = size
+        self._links: list[dict[int, _Link]] = [{} for _ in size]
+        self._into = list(range(len(size)))
         self._heap: list[tuple[float, int, int]] = []
         self._square = unit**2
 
@@ -119,8 +120,7 @@ class _Linkage:
     def _cost(self, first: int, second: int, link: _Link) -> float:
         """Return the mean square distance of groups as a share of the limit; infinite where they must stay apart."""
         square, metres, covisible, side_by_side = link
-        one, other = self._seen_by[first], self._seen_by[second]
-        if metres <= 0 or one is None or other is None or side_by_side > SIDE_BY_SIDE * min(len(one), len(other)):
+        if metres <= 0 or side_by_side > SIDE_BY_SIDE * min(self._size[first], self._size[second]):
             return np.inf
         return square / metres / (self._square * (1 + (REACH**2 - 1) * covisible / metres))
 
@@ -138,8 +138,8 @@ class _Linkage:
     def _join(self, first: int, second: int) -> None:
         if len(self._links[first]) < len(self._links[second]):
             first, second = second, first
-        (kept, gone), links = (self._seen_by[first], self._seen_by[second]), self._links
-        self._seen_by[first], self._seen_by[second] = (kept or set()) | (gone or set()), None
+        links = self._links
+        self._size[first] += self._size[second]
         self._into[second] = first
         del links[first][second]
         for other, link in links[second].items():

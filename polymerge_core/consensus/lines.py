@@ -20,9 +20,11 @@ from scipy.sparse.csgraph import connected_components
 
 from polymerge_core.consensus.alongside import Pairs, pairs_alongside
 from polymerge_core.consensus.association import associate
+from polymerge_core.consensus.axes import Axes
+from polymerge_core.consensus.drift import Drift, estimate_drift, no_drift, pulls
 from polymerge_core.consensus.fusion import Fit, Noise, fuse
 from polymerge_core.consensus.layout import first_axes
-from polymerge_core.consensus.looks import Looks
+from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.membership import settle
 from polymerge_core.consensus.registration import centres, corrected, corrections, equations
 from polymerge_core.consensus.support import Stretches, Support, stretch_of, support, supported_stretches
@@ -31,8 +33,8 @@ from polymerge_core.curves import Array, Index
 #: Looks are given to the lines anew at most so often; by then they have settled.
 _ROUNDS = 3
 
-#: How often the drives are corrected, and their lines put together anew.
-_DRIVES = 2
+#: How often the lines of the drives are put together, each time after the drives were shifted anew.
+_DRIFTS = 3
 
 #: How often the local maps are corrected, and the lines fitted anew.
 _CORRECTIONS = 2
@@ -94,10 +96,12 @@ def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tup
         return [], np.zeros((0, 3))
     states = []
     for number, looks in enumerate(classes):
-        states.append(_trace_by_drive(looks))
+        states.append(trace(looks, looks.instances.drive[looks.instance]))
         advance(0.6 * (number + 1) / len(classes))
     centre = centres(classes, len(classes[0].instances))
     moved = np.zeros((len(centre), 3))
+    if len(np.unique(classes[0].instances.drive)) > 1:
+        states, moved[:, :2] = _join_drives(states, centre)
     for number in range(_CORRECTIONS):
         states, step = _register(states, centre, moved)
         moved += step
@@ -105,31 +109,70 @@ def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tup
     return [_finish(state) for state in states], moved
 
 
-def _trace_by_drive(looks: Looks) -> _State:
-    """Put together what each drive saw, then what the drives saw.
+def _join_drives(states: list[_State], centre: Array) -> tuple[list[_State], Array]:
+    """Put the lines of the drives together, each drive shifted to where the drives together are.
 
     Frames of one drive share their errors, so that they lie close together; and what a drive saw as a whole is long
     enough to tell which of the other drives' lines it runs along.
     """
-    drive = looks.instances.drive[looks.instance]
-    state = trace(looks, drive)
-    if len(np.unique(drive)) == 1:
-        return state
-    owner = np.zeros(len(state.fit.axes.curves), np.intp)
-    owner[state.group] = drive
-    tracks = Looks.of(state.fit.axes.curves.lines, owner, np.ones(len(owner)), looks.instances.by_drive(), looks.unit)
-    every = np.zeros(len(tracks), np.intp)
-    lines = trace(tracks, every)
-    centre = centres([tracks], len(tracks.instances))
-    moved = np.zeros((len(centre), 3))
-    for _ in range(_DRIVES):
-        for _ in range(_CORRECTIONS):
-            (lines,), step = _register([lines], centre, moved)
-            looks = corrected(looks, step[looks.instances.drive], centre[looks.instances.drive])
-            moved += step
-        lines = trace(lines.looks.redrawn(), every)
-    group = lines.group[state.group]
-    fit = fuse(looks, group, lines.fit.axes, Noise(state.fit.sigma, lines.fit.drive_sigma))
+    instances, unit = states[0].looks.instances, states[0].looks.unit
+    drives = instances.by_drive()
+    tracks = [_tracks(state, drives) for state in states]
+    drift = no_drift()
+    joined: list[_State] = []
+    for _ in range(_DRIFTS):
+        joined = [trace(_shifted(each.looks, drift), np.zeros(len(each.looks), np.intp)) for each in tracks]
+        drift = estimate_drift([pulls(state.looks, state.fit, drift) for state in joined], unit)
+    correction = np.column_stack([drift.at(instances.drive, centre), np.zeros(len(centre))])
+    parts = zip(states, tracks, joined, strict=True)
+    return [_of_all_drives(*part, correction, centre) for part in parts], correction[:, :2]
+
+
+class _Tracks(NamedTuple):
+    """The lines that the drives saw, each drive for itself."""
+
+    #: As looks of the drives.
+    looks: Looks
+    #: The track that each look of a frame is part of; -1 where too few frames of its drive agree with it.
+    track: Index
+
+
+def _tracks(state: _State, drives: Instances) -> _Tracks:
+    looks, axes = state.looks, state.fit.axes
+    drive = np.zeros(len(axes.counts), np.intp)
+    drive[state.group] = looks.instances.drive[looks.instance]
+    found = supported_stretches(axes, support(looks, state.group, axes, drive))
+    lines = _shapes(axes.stations, found, 0.0)
+    owner = drive[axes.line[found.first]]
+    stretch = stretch_of(found, state.fit.feet.station)
+    # A look is part of the stretch that most of it runs along.
+    count = len(lines) + 1
+    votes, place = np.unique(looks.owner * count + stretch + 1, return_inverse=True)
+    metres = np.bincount(place, looks.metres)
+    order = np.lexsort((votes, -metres.round(9), votes // count))
+    best = order[np.diff(votes[order] // count, prepend=-1) != 0]
+    track = votes[best] % count - 1
+    return _Tracks(Looks.of(lines, owner, np.ones(len(lines)), drives, looks.unit), track)
+
+
+def _shifted(tracks: Looks, drift: Drift) -> Looks:
+    points = tracks.points + drift.at(tracks.instances.drive[tracks.point_instance], tracks.points)
+    return tracks.moved(points).redrawn()
+
+
+def _of_all_drives(state: _State, tracks: _Tracks, joined: _State, correction: Array, centre: Array) -> _State:
+    """Give the looks of the frames to the lines of all drives; what is on no track stays a line of its own."""
+    looks = corrected(state.looks, correction, centre)
+    axes, alone = joined.fit.axes, tracks.track < 0
+    left, own = np.unique(state.group[alone], return_inverse=True)
+    group = np.zeros(len(looks), np.intp)
+    group[~alone] = joined.group[tracks.track[~alone]]
+    group[alone] = len(axes.counts) + own
+    before = state.fit.axes
+    there = np.isin(before.line, left)
+    line = np.concatenate([axes.line, len(axes.counts) + np.searchsorted(left, before.line[there])])
+    every = Axes(np.concatenate([axes.stations, before.stations[there]]), line)
+    fit = fuse(looks, group, every, Noise(state.fit.sigma, joined.fit.drive_sigma))
     return _State(looks, group, fit)
 
 

@@ -18,8 +18,12 @@ from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.membership import points_beside, sightings
 from polymerge_core.curves import Array, Index
 
-#: What fewer than this share of the local maps saw that were expected to is left out.
-SHARE = 0.6
+#: What is seen as often as expected is seen so by chance now and then: fewer than this times the square root of what is
+#: expected is too few ...
+_CHANCE = 0.6
+
+#: ... and so is less than this share of it, however often it was seen: false detections pile up too.
+_SHARE = 0.25
 
 #: Lines that so many local maps saw tell how likely one is to be seen.
 SURE = 3
@@ -50,16 +54,20 @@ class Stretches(NamedTuple):
     last: Index
 
 
-def support(looks: Looks, group: Index, axes: Axes) -> Support:
-    """Count who saw each station, and who should have."""
+def support(looks: Looks, group: Index, axes: Axes, drive: Index | None = None) -> Support:
+    """Count who saw each station, and who should have; of `drive` alone, the drive of each line, where it is given."""
     pairs = _sightings(looks, group, axes)
     stations, instances = len(axes.line), len(looks.instances)
     seen = np.bincount(pairs // instances, minlength=stations)
     seen = axes.around(seen).astype(np.intp)
-    return Support(seen, expected_sightings(axes.stations, pairs, seen, looks.instances, _SQUARE * looks.unit))
+    of_station = None if drive is None else drive[axes.line]
+    square = _SQUARE * looks.unit
+    return Support(seen, expected_sightings(axes.stations, pairs, seen, looks.instances, square, of_station))
 
 
-def expected_sightings(places: Array, pairs: Index, seen: Index, instances: Instances, square: float) -> Array:
+def expected_sightings(
+    places: Array, pairs: Index, seen: Index, instances: Instances, square: float, drive: Index | None = None
+) -> Array:
     """Return how many local maps should have seen each place.
 
     Parameters
@@ -74,6 +82,8 @@ def expected_sightings(places: Array, pairs: Index, seen: Index, instances: Inst
         The local maps.
     square : float
         Side of the squares, in the vehicle's frame, by which the chance of a sighting is learned, metres.
+    drive : ndarray of int, shape (s,), optional
+        Only local maps of this drive are expected to see the place.
 
     Returns
     -------
@@ -84,6 +94,9 @@ def expected_sightings(places: Array, pairs: Index, seen: Index, instances: Inst
         return np.zeros(len(places))
     tree = shapely.STRtree(shapely.points(places))
     instance, place = tree.query(instances.footprint, predicate="contains")
+    if drive is not None:
+        own = instances.drive[instance] == drive[place]
+        instance, place = instance[own], place[own]
     saw = np.isin(place * len(instances) + instance, pairs)
     offset = places[place] - instances.position[instance]
     sine, cosine = np.sin(instances.heading[instance]), np.cos(instances.heading[instance])
@@ -97,6 +110,11 @@ def expected_sightings(places: Array, pairs: Index, seen: Index, instances: Inst
     # A square that few sure lines fell into takes after the others.
     chance = (np.bincount(cell, saw & sure) + overall) / (np.bincount(cell, sure) + 1.0)
     return np.bincount(place, chance[cell], minlength=len(places)).astype(float)
+
+
+def enough(seen: Index, expected: Array) -> NDArray[np.bool_]:
+    """Tell what was seen often enough to be there."""
+    return np.asarray(seen >= np.maximum(_CHANCE * np.sqrt(expected), _SHARE * expected))
 
 
 def _sightings(looks: Looks, group: Index, axes: Axes) -> Index:
@@ -116,7 +134,7 @@ def _sightings(looks: Looks, group: Index, axes: Axes) -> Index:
 
 def supported_stretches(axes: Axes, support: Support) -> Stretches:
     """Return the stretches of the lines that enough local maps saw, short gaps bridged."""
-    kept = (support.seen > 0) & (support.seen >= SHARE * np.sqrt(support.expected))
+    kept = (support.seen > 0) & enough(support.seen, support.expected)
     rows = np.flatnonzero(kept)
     if len(rows) == 0:
         empty = np.empty(0, np.intp)
