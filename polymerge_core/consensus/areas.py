@@ -123,7 +123,7 @@ def group_areas(
     cost = np.where(same, 0.0, (1.0 - share) / (1.0 - OVERLAP))
     links = Links(first, second, cost, np.where(same, 0.0, 1.0), np.zeros(len(first)), same.astype(float))
     alike = whole[first] == whole[second]
-    group = link_groups(np.ones(len(polygons)), links.take(alike), 1.0)
+    group = link_groups(instance, np.ones(len(polygons)), links.take(alike), 1.0)
     joined = _join_cut(polygons, links.take(~alike), group, whole, unit)
     return np.asarray(pd.factorize(joined)[0], dtype=np.intp)
 

@@ -3,7 +3,7 @@
 Looks that run closest together are put together first, and groups go on being put together while the root mean square
 distance between their looks is below a limit. Two lines that one local map saw side by side are different lines
 (cannot-link; Wagstaff et al. 2001, "Constrained k-means clustering with background knowledge"): groups are kept apart
-where local maps saw both over most of the smaller one.
+where many local maps saw both.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from polymerge_core.consensus.alongside import REACH, Pairs
 from polymerge_core.consensus.looks import Looks
 from polymerge_core.curves import Array, Index
 
-#: Groups that single local maps saw side by side over more than this share of the smaller one are different lines. Over
-#: less of it a predictor draws a line twice, or invents one beside it.
+#: Groups that more than this share of the local maps of the smaller one saw side by side are different lines. Fewer only
+#: drew one twice, or invented one beside it; and what each saw side by side over a part of its length counts as that part.
 SIDE_BY_SIDE = 0.4
 
 _Link = tuple[float, float, float, float]
@@ -53,7 +53,7 @@ def associate(looks: Looks, pairs: Pairs) -> Index:
     metres = np.where(same, 0.0, pairs.overlap + pairs.apart)
     covisible = np.where(same, 0.0, pairs.covisible * pairs.overlap)
     links = Links(pairs.short, pairs.long, square, metres, covisible, side_by_side)
-    return link_groups(looks.curves.length, links, looks.unit)
+    return link_groups(looks.instance, looks.curves.length, links, looks.unit)
 
 
 class Links(NamedTuple):
@@ -74,11 +74,13 @@ class Links(NamedTuple):
         return Links._make(column[rows] for column in self)
 
 
-def link_groups(size: Array, links: Links, unit: float) -> Index:
+def link_groups(instance: Index, size: Array, links: Links, unit: float) -> Index:
     """Put together what is closest, until nothing is close enough.
 
     Parameters
     ----------
+    instance : ndarray of int, shape (n,)
+        The local map of each look.
     size : ndarray of float, shape (n,)
         Length of each look.
     links : Links
@@ -91,7 +93,7 @@ def link_groups(size: Array, links: Links, unit: float) -> Index:
     ndarray of int, shape (n,)
         The group of each look, numbered from 0 in the order of their first looks.
     """
-    linkage = _Linkage(size.tolist(), unit)
+    linkage = _Linkage(instance.tolist(), size.tolist(), unit)
     values = zip(*(column.tolist() for column in links[2:]), strict=True)
     for first, second, link in zip(links.first.tolist(), links.second.tolist(), values, strict=True):
         linkage.link(first, second, link)
@@ -101,8 +103,9 @@ def link_groups(size: Array, links: Links, unit: float) -> Index:
 class _Linkage:
     """Groups of looks, the links between them, and which two are to be put together next."""
 
-    def __init__(self, size: list[float], unit: float) -> None:
-        self._size = size
+    def __init__(self, instance: list[int], size: list[float], unit: float) -> None:
+        #: How much of each group each local map saw.
+        self._seen = [{one: length} for one, length in zip(instance, size, strict=True)]
         self._links: list[dict[int, _Link]] = [{} for _ in size]
         self._into = list(range(len(size)))
         self._heap: list[tuple[float, int, int]] = []
@@ -120,9 +123,17 @@ class _Linkage:
     def _cost(self, first: int, second: int, link: _Link) -> float:
         """Return the mean square distance of groups as a share of the limit; infinite where they must stay apart."""
         square, metres, covisible, side_by_side = link
-        if metres <= 0 or side_by_side > SIDE_BY_SIDE * min(self._size[first], self._size[second]):
+        if metres <= 0 or (side_by_side > 0 and self._apart(first, second, side_by_side)):
             return np.inf
         return square / metres / (self._square * (1 + (REACH**2 - 1) * covisible / metres))
+
+    def _apart(self, first: int, second: int, side_by_side: float) -> bool:
+        """Tell whether too many local maps saw both groups, side by side over much of what they saw."""
+        one, other = self._seen[first], self._seen[second]
+        few, many = (one, other) if len(one) <= len(other) else (other, one)
+        both = few.keys() & many.keys()
+        length = sum(min(few[instance], many[instance]) for instance in sorted(both))
+        return min(1.0, side_by_side / length) * len(both) > SIDE_BY_SIDE * len(few)
 
     def run(self) -> Index:
         """Put groups together, the closest first, while any two are close enough."""
@@ -139,7 +150,8 @@ class _Linkage:
         if len(self._links[first]) < len(self._links[second]):
             first, second = second, first
         links = self._links
-        self._size[first] += self._size[second]
+        for instance, length in self._seen[second].items():
+            self._seen[first][instance] = self._seen[first].get(instance, 0.0) + length
         self._into[second] = first
         del links[first][second]
         for other, link in links[second].items():
