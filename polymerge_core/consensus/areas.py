@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from polymerge_core.consensus.association import Links, link_groups
 from polymerge_core.consensus.fusion import HALF_WEIGHT
 from polymerge_core.consensus.looks import Instances
-from polymerge_core.consensus.support import enough, expected_sightings
+from polymerge_core.consensus.support import judge
 from polymerge_core.curves import Array, Index
 
 #: Looks belong together where they have this share of the smaller one in common, in the mean.
@@ -96,12 +96,11 @@ def merge_looks_at_areas(
     shapes = np.array([shape for shape, _ in fused], dtype=object)
     sigma = np.array([error for _, error in fused])
     pairs = np.unique(group * len(instances) + instance)
-    seen = np.bincount(pairs // len(instances), minlength=len(shapes))
     places = shapely.get_coordinates(shapely.centroid(shapes))
-    expected = expected_sightings(places, pairs, seen, instances, _SQUARE * unit)
-    kept = enough(seen, expected)
+    support = judge(places, pairs, instances, _SQUARE * unit)
+    kept = support.enough
     number = np.where(kept, np.cumsum(kept) - 1, -1)
-    return Areas(shapes[kept], sigma[kept], seen[kept].astype(float), expected[kept], number[group])
+    return Areas(shapes[kept], sigma[kept], support.seen[kept].astype(float), support.expected[kept], number[group])
 
 
 def group_areas(

@@ -25,7 +25,7 @@ from polymerge_core.consensus.drift import Drift, estimate_drift, no_drift, pull
 from polymerge_core.consensus.fusion import Fit, Noise, fuse
 from polymerge_core.consensus.layout import first_axes
 from polymerge_core.consensus.looks import Instances, Looks
-from polymerge_core.consensus.membership import settle
+from polymerge_core.consensus.membership import line_along, settle
 from polymerge_core.consensus.registration import centres, corrected, corrections, equations
 from polymerge_core.consensus.support import Stretches, Support, stretch_of, support, supported_stretches
 from polymerge_core.curves import Array, Index
@@ -35,6 +35,9 @@ _ROUNDS = 3
 
 #: How often the lines of the drives are put together, each time after the drives were shifted anew.
 _DRIFTS = 3
+
+#: A piece of a drive's line is longer than so many points.
+_SHORT_TRACK = 3
 
 #: How often the local maps are corrected, and the lines fitted anew.
 _CORRECTIONS = 2
@@ -120,9 +123,11 @@ def _join_drives(states: list[_State], centre: Array) -> tuple[list[_State], Arr
     tracks = [_tracks(state, drives) for state in states]
     drift = no_drift()
     joined: list[_State] = []
-    for _ in range(_DRIFTS):
+    for number in range(_DRIFTS):
         joined = [trace(_shifted(each.looks, drift), np.zeros(len(each.looks), np.intp)) for each in tracks]
         drift = estimate_drift([pulls(state.looks, state.fit, drift) for state in joined], unit)
+        if number + 1 < _DRIFTS:
+            tracks = [_cut(each, state) for each, state in zip(tracks, joined, strict=True)]
     correction = np.column_stack([drift.at(instances.drive, centre), np.zeros(len(centre))])
     parts = zip(states, tracks, joined, strict=True)
     return [_of_all_drives(*part, correction, centre) for part in parts], correction[:, :2]
@@ -133,26 +138,64 @@ class _Tracks(NamedTuple):
 
     #: As looks of the drives.
     looks: Looks
-    #: The track that each look of a frame is part of; -1 where too few frames of its drive agree with it.
+    #: The track of each station of the drives' lines, -1 where too few frames of the drive saw the line there, and which
+    #: point of the track it is.
     track: Index
+    point: Index
 
 
 def _tracks(state: _State, drives: Instances) -> _Tracks:
-    looks, axes = state.looks, state.fit.axes
+    axes = state.fit.axes
     drive = np.zeros(len(axes.counts), np.intp)
-    drive[state.group] = looks.instances.drive[looks.instance]
-    found = supported_stretches(axes, support(looks, state.group, axes, drive))
+    drive[state.group] = state.looks.instances.drive[state.looks.instance]
+    found = supported_stretches(axes, support(state.looks, state.group, axes, drive))
+    track = stretch_of(found, np.arange(len(axes.line)))
+    number = np.arange(len(axes.line)) - np.where(track >= 0, found.first[track], 0) if len(found.first) else track
     lines = _shapes(axes.stations, found, 0.0)
-    owner = drive[axes.line[found.first]]
-    stretch = stretch_of(found, state.fit.feet.station)
-    # A look is part of the stretch that most of it runs along.
-    count = len(lines) + 1
-    votes, place = np.unique(looks.owner * count + stretch + 1, return_inverse=True)
+    return _drawn(lines, drive[axes.line[found.first]], drives, state.looks.unit, track, number)
+
+
+def _drawn(lines: NDArray[np.object_], drive: Index, drives: Instances, unit: float, track: Index, number: Index) -> _Tracks:
+    """Return tracks from their lines; the numbers of the vertices become those of the points that answer to them."""
+    looks = Looks.of(lines, drive, np.ones(len(lines)), drives, unit)
+    last, points = shapely.get_num_coordinates(lines) - 1, np.bincount(looks.owner, minlength=len(lines))
+    share = (points - 1) / np.maximum(last, 1)
+    point = np.where(track >= 0, np.round(number * share[track]), -1).astype(np.intp) if len(lines) else track
+    return _Tracks(looks, track, point)
+
+
+def _cut(tracks: _Tracks, joined: _State) -> _Tracks:
+    """Cut the tracks where too few drives saw the line that they are part of: there they may change from line to line."""
+    looks, axes = joined.looks, joined.fit.axes
+    found = supported_stretches(axes, support(looks, joined.group, axes))
+    piece = stretch_of(found, joined.fit.feet.station)
+    begins = (np.diff(looks.owner, prepend=-1) != 0) | (np.diff(piece, prepend=-2) != 0)
+    run = np.cumsum(begins) - 1
+    first = np.flatnonzero(begins)
+    size = np.diff(np.append(first, len(run)))
+    kept = (piece[first] >= 0) & (size > _SHORT_TRACK)
+    name = np.where(kept, np.cumsum(kept) - 1, -1)
+    # The same points of the tracks as they were before they were shifted.
+    start = np.flatnonzero(np.diff(tracks.looks.owner, prepend=-1))
+    there = tracks.track >= 0
+    place = np.where(there, start[tracks.track] + tracks.point, 0) if len(start) else tracks.track
+    track = np.where(there, name[run[place]], -1)
+    number = np.where(track >= 0, place - first[run[place]], 0)
+    inside = np.flatnonzero(name[run] >= 0)
+    lines = shapely.linestrings(tracks.looks.points[inside], indices=name[run[inside]])
+    drive = tracks.looks.instance[looks.owner[first[kept]]]
+    return _drawn(lines, drive, tracks.looks.instances, looks.unit, track, number)
+
+
+def _track_of_looks(state: _State, tracks: _Tracks) -> Index:
+    """Return the track that most of each look runs along, -1 for none."""
+    looks = state.looks
+    count = len(tracks.looks) + 1
+    votes, place = np.unique(looks.owner * count + tracks.track[state.fit.feet.station] + 1, return_inverse=True)
     metres = np.bincount(place, looks.metres)
     order = np.lexsort((votes, -metres.round(9), votes // count))
     best = order[np.diff(votes[order] // count, prepend=-1) != 0]
-    track = votes[best] % count - 1
-    return _Tracks(Looks.of(lines, owner, np.ones(len(lines)), drives, looks.unit), track)
+    return np.asarray(votes[best] % count - 1)
 
 
 def _shifted(tracks: Looks, drift: Drift) -> Looks:
@@ -163,10 +206,12 @@ def _shifted(tracks: Looks, drift: Drift) -> Looks:
 def _of_all_drives(state: _State, tracks: _Tracks, joined: _State, correction: Array, centre: Array) -> _State:
     """Give the looks of the frames to the lines of all drives; what is on no track stays a line of its own."""
     looks = corrected(state.looks, correction, centre)
-    axes, alone = joined.fit.axes, tracks.track < 0
+    axes, track = joined.fit.axes, _track_of_looks(state, tracks)
+    on_track = track >= 0
+    group = line_along(looks, axes)
+    group[on_track] = joined.group[track[on_track]]
+    alone = group < 0
     left, own = np.unique(state.group[alone], return_inverse=True)
-    group = np.zeros(len(looks), np.intp)
-    group[~alone] = joined.group[tracks.track[~alone]]
     group[alone] = len(axes.counts) + own
     before = state.fit.axes
     there = np.isin(before.line, left)

@@ -118,9 +118,11 @@ class Looks:
         return np.nan_to_num(away)
 
     def redrawn(self) -> Looks:
-        """Return the looks as they lie now, after all corrections."""
-        lines = shapely.linestrings(self.points, indices=self.owner)
-        return Looks.of(lines, self.instance, self.weight, self.instances, self.unit)
+        """Return the looks as they lie now, through their points."""
+        curves = Curves(shapely.linestrings(self.points, indices=self.owner))
+        tangent = direction_at(curves, self.owner, curves.arc, _HALF_CHORD * self.unit)
+        metres = (curves.length / np.bincount(self.owner, minlength=len(curves)))[self.owner]
+        return replace(self, curves=curves, arc=curves.arc, metres=metres, tangent=tangent)
 
     def moved(self, points: Array) -> Looks:
         """Return the same looks with their points elsewhere."""

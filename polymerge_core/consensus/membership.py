@@ -63,6 +63,28 @@ def sightings(looks: Looks, group: Index, beside: Beside) -> tuple[Index, Index]
     return pairs // instances, pairs % instances
 
 
+def line_along(looks: Looks, axes: Axes) -> Index:
+    """Return the line that most of each look runs along, -1 where it runs along none, shape (n,)."""
+    beside = points_beside(looks, axes)
+    owner = looks.owner[beside.point]
+    metres = looks.metres[beside.point]
+    key, place = np.unique(owner * len(axes.counts) + beside.line, return_inverse=True)
+    agrees = np.bincount(place, (1 - (beside.lateral / _limit(looks)) ** 2) * metres)
+    much = (np.bincount(place, metres) > looks.curves.length[key // len(axes.counts)] / 2) & (agrees > 0)
+    key, agrees = key[much], agrees[much]
+    look = key // len(axes.counts)
+    order = np.lexsort((-np.round(agrees, 9), look))
+    best = order[np.diff(look[order], prepend=-1) != 0]
+    found = np.full(len(looks), -1)
+    found[look[best]] = key[best] % len(axes.counts)
+    return found
+
+
+def _limit(looks: Looks) -> float:
+    """Return how far beside a line a look may lie, metres."""
+    return looks.unit * (REACH if looks.instances.footprint is not None else 1.0)
+
+
 def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
     """Give each look to the line that it agrees with over the greatest length.
 
@@ -87,7 +109,7 @@ def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
     owner = looks.owner[beside.point]
     own = beside.line == group[owner]
     others = np.clip(seen[beside.station] - own, 0, _ENOUGH) / _ENOUGH
-    limit = looks.unit * (REACH if looks.instances.footprint is not None else 1.0)
+    limit = _limit(looks)
     of_line = np.zeros(int(axes.line.max(initial=0)) + 1, np.intp)
     of_line[group] = kind
     alike = of_line[beside.line] == kind[owner]

@@ -39,12 +39,20 @@ _SHORT = 3
 
 
 class Support(NamedTuple):
-    """How well each station is supported."""
+    """How well each place is supported, one entry a place."""
 
     #: Local maps that saw it.
     seen: Index
     #: Local maps that should have seen it; 0 where footprints are not known.
     expected: Array
+    #: Drives that saw it, and that should have: a drive errs in all its frames alike.
+    seen_drives: Index
+    expected_drives: Array
+
+    @property
+    def enough(self) -> NDArray[np.bool_]:
+        """Which places were seen often enough to be there."""
+        return _enough(self.seen, self.expected) & _enough(self.seen_drives, self.expected_drives)
 
 
 class Stretches(NamedTuple):
@@ -57,18 +65,13 @@ class Stretches(NamedTuple):
 def support(looks: Looks, group: Index, axes: Axes, drive: Index | None = None) -> Support:
     """Count who saw each station, and who should have; of `drive` alone, the drive of each line, where it is given."""
     pairs = _sightings(looks, group, axes)
-    stations, instances = len(axes.line), len(looks.instances)
-    seen = np.bincount(pairs // instances, minlength=stations)
-    seen = axes.around(seen).astype(np.intp)
     of_station = None if drive is None else drive[axes.line]
-    square = _SQUARE * looks.unit
-    return Support(seen, expected_sightings(axes.stations, pairs, seen, looks.instances, square, of_station))
+    found = judge(axes.stations, pairs, looks.instances, _SQUARE * looks.unit, of_station)
+    return Support._make(axes.around(column) for column in found)
 
 
-def expected_sightings(
-    places: Array, pairs: Index, seen: Index, instances: Instances, square: float, drive: Index | None = None
-) -> Array:
-    """Return how many local maps should have seen each place.
+def judge(places: Array, pairs: Index, instances: Instances, square: float, drive: Index | None = None) -> Support:
+    """Count who saw each place, and who should have.
 
     Parameters
     ----------
@@ -76,44 +79,51 @@ def expected_sightings(
         Metres.
     pairs : ndarray of int
         ``place * len(instances) + instance`` of every sighting; rising.
-    seen : ndarray of int, shape (s,)
-        How many saw each place.
     instances : Instances
         The local maps.
     square : float
         Side of the squares, in the vehicle's frame, by which the chance of a sighting is learned, metres.
     drive : ndarray of int, shape (s,), optional
         Only local maps of this drive are expected to see the place.
-
-    Returns
-    -------
-    ndarray of float, shape (s,)
-        0 where footprints are not known.
     """
+    count, drives = len(instances), int(instances.drive.max(initial=-1)) + 1
+    seen = np.bincount(pairs // count, minlength=len(places)) if len(pairs) else np.zeros(len(places), np.intp)
+    seen_by = np.unique(pairs // count * drives + instances.drive[pairs % count])
+    seen_drives = np.bincount(seen_by // drives, minlength=len(places)) if len(pairs) else seen
     if instances.footprint is None or len(places) == 0:
-        return np.zeros(len(places))
-    tree = shapely.STRtree(shapely.points(places))
-    instance, place = tree.query(instances.footprint, predicate="contains")
+        return Support(seen, np.zeros(len(places)), seen_drives, np.zeros(len(places)))
+    instance, place = shapely.STRtree(shapely.points(places)).query(instances.footprint, predicate="contains")
     if drive is not None:
         own = instances.drive[instance] == drive[place]
         instance, place = instance[own], place[own]
-    saw = np.isin(place * len(instances) + instance, pairs)
-    offset = places[place] - instances.position[instance]
+    saw = np.isin(place * count + instance, pairs)
+    chance = _chances(places[place], instances, instance, saw, (seen >= SURE)[place], square)
+    expected = np.bincount(place, chance, minlength=len(places)).astype(float)
+    # A drive should have seen what one of its local maps at least should have.
+    passed, inverse = np.unique(place * drives + instances.drive[instance], return_inverse=True)
+    passed = passed[np.bincount(inverse, chance) >= 1.0]
+    sure = (seen_drives >= SURE)[passed // drives]
+    share = np.isin(passed, seen_by)[sure].mean() if sure.any() else 1.0
+    return Support(seen, expected, seen_drives, share * np.bincount(passed // drives, minlength=len(places)))
+
+
+def _chances(
+    places: Array, instances: Instances, instance: Index, saw: NDArray[np.bool_], sure: NDArray[np.bool_], square: float
+) -> Array:
+    """Return how likely each local map was to see each place, by where that lies from its vehicle."""
+    offset = places - instances.position[instance]
     sine, cosine = np.sin(instances.heading[instance]), np.cos(instances.heading[instance])
     ahead = np.nan_to_num(cosine * offset[:, 0] + sine * offset[:, 1])
     aside = np.nan_to_num(cosine * offset[:, 1] - sine * offset[:, 0])
     cells = np.floor(np.column_stack([ahead, aside]) / square).astype(np.intp)
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
-    cell = cell.ravel()
-    sure = (seen >= SURE)[place]
-    overall = saw[sure].mean() if sure.any() else saw.mean()
+    cell = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    overall = saw[sure].mean() if sure.any() else saw.mean() if len(saw) else 0.0
     # A square that few sure lines fell into takes after the others.
     chance = (np.bincount(cell, saw & sure) + overall) / (np.bincount(cell, sure) + 1.0)
-    return np.bincount(place, chance[cell], minlength=len(places)).astype(float)
+    return np.asarray(chance[cell])
 
 
-def enough(seen: Index, expected: Array) -> NDArray[np.bool_]:
-    """Tell what was seen often enough to be there."""
+def _enough(seen: Index, expected: Array) -> NDArray[np.bool_]:
     return np.asarray(seen >= np.maximum(_CHANCE * np.sqrt(expected), _SHARE * expected))
 
 
@@ -134,7 +144,7 @@ def _sightings(looks: Looks, group: Index, axes: Axes) -> Index:
 
 def supported_stretches(axes: Axes, support: Support) -> Stretches:
     """Return the stretches of the lines that enough local maps saw, short gaps bridged."""
-    kept = (support.seen > 0) & enough(support.seen, support.expected)
+    kept = (support.seen > 0) & support.enough
     rows = np.flatnonzero(kept)
     if len(rows) == 0:
         empty = np.empty(0, np.intp)
