@@ -103,9 +103,7 @@ def merge_looks_at_areas(
     return Areas(shapes[kept], sigma[kept], support.seen[kept].astype(float), support.expected[kept], number[group])
 
 
-def group_areas(
-    polygons: NDArray[np.object_], instance: Index, whole: NDArray[np.bool_], unit: float
-) -> Index:
+def group_areas(polygons: NDArray[np.object_], instance: Index, whole: NDArray[np.bool_], unit: float) -> Index:
     """Group looks at the same area, numbered from 0 in the order of their first looks.
 
     Looks that hold their area whole say which areas there are. One that was cut off has a share of any of them that

@@ -19,8 +19,8 @@ from polymerge_core.consensus.alongside import REACH, Pairs
 from polymerge_core.consensus.looks import Looks
 from polymerge_core.curves import Array, Index
 
-#: Groups that more than this share of the local maps of the smaller one saw side by side are different lines. Fewer only
-#: drew one twice, or invented one beside it; and what each saw side by side over a part of its length counts as that part.
+#: Groups that more than this share of the local maps of the smaller one saw side by side are different lines. Fewer
+#: only drew one twice, or invented one beside it. A local map that saw them so over half their length counts half.
 SIDE_BY_SIDE = 0.4
 
 _Link = tuple[float, float, float, float]

@@ -101,7 +101,9 @@ class Axes:
     @cached_property
     def _tree(self) -> cKDTree:
         # Lines are told apart by a third axis, on which they are farther from each other than anything on the plane.
-        return cKDTree(np.column_stack([self.stations, LINE_APART * self.line]), balanced_tree=False, compact_nodes=False)
+        return cKDTree(
+            np.column_stack([self.stations, LINE_APART * self.line]), balanced_tree=False, compact_nodes=False
+        )
 
     def feet(self, points: Array, line: Index, unit: float) -> Feet:
         """Project points onto given lines: to the segment before or after the nearest station."""

@@ -129,4 +129,3 @@ def _kernel(drive: Index, points: Array, others: Index, places: Array, reach: fl
     share = near.data / reach
     value = (1 - share) ** 4 * (4 * share + 1)
     return csr_array((value, (near.row, near.col)), shape=near.shape)
-

@@ -34,6 +34,11 @@ _LEAST = 0.01
 #: Noise before any is known, proximities.
 FIRST_NOISE = 0.4
 
+#: What all looks of a drive have in common never shows between them, such as a camera that draws everything near the
+#: vehicle too far left. It is taken to be this much, proximities, so that no look counts far more than all others.
+SHARED = 0.4
+
+_TINY = float(np.finfo(float).tiny)
 _BINS = 6
 _FEW = 30
 
@@ -104,11 +109,10 @@ def fuse(looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 
     for _ in range(rounds):
         axes = axes.reaching(axes.feet(looks.points, line, looks.unit), line).spaced(looks.unit)
         feet, used = _feet(looks, axes, line)
-        offset, weight = map(axes.around, _offsets(looks, feet, used, noise, len(axes.line)))
+        offset, weight, error = map(axes.around, _offsets(looks, feet, used, noise, len(axes.line)))
         # Rounding must not open a ring.
         moved = axes.around(axes.stations + offset[:, None] * axes.normal)
         axes = Axes(moved, axes.line).smoothed(weight)
-        error = 1.0 / np.sqrt(np.maximum(weight, np.finfo(float).tiny))
     feet, used = _feet(looks, axes, line)
     sigma = _noise_by_distance(looks, group, feet, used)
     return Fit(axes, feet, used, sigma, _noise_of_drives(looks, feet, used, sigma), error)
@@ -119,27 +123,32 @@ def _feet(looks: Looks, axes: Axes, line: Index) -> tuple[Feet, NDArray[np.bool_
     return feet, feet.beside & (np.abs(feet.lateral) <= 2 * REACH * looks.unit)
 
 
-def _offsets(looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, count: int) -> tuple[Array, Array]:
-    """Return how far to the left of each station its looks lie, and how surely (1 / variance)."""
+def _offsets(looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, count: int) -> tuple[Array, Array, Array]:
+    """Return how far to the left of each station its looks lie, how much they count, and the standard error of that."""
     rows = np.flatnonzero(used)
     station, lateral, sigma = feet.station[rows], feet.lateral[rows], noise.sigma[rows]
     drive = looks.instances.drive[looks.point_instance[rows]]
     drives = int(drive.max(initial=0)) + 1
     cell, place = np.unique(station * drives + drive, return_inverse=True)
-    information = looks.weight[looks.owner[rows]] * looks.metres[rows] / looks.unit / sigma**2
+    of_cell = cell // drives
+    share = looks.weight[looks.owner[rows]] * looks.metres[rows] / looks.unit
+    information = share / (sigma**2 + (SHARED * looks.unit) ** 2)
     middle, scale = np.zeros(count), HALF_WEIGHT * sigma
-    offset = weight = middle
+    offset, weight, error = middle, middle, middle
     for _ in range(3):
         robust = information / (1 + ((lateral - middle[station]) / scale) ** 2)
-        total = np.bincount(place, robust)
-        said = np.bincount(place, robust * lateral) / np.maximum(total, np.finfo(float).tiny)
-        sure = 1.0 / (noise.drive_sigma**2 + 1.0 / np.maximum(total, np.finfo(float).tiny))
+        total = np.maximum(np.bincount(place, robust), _TINY)
+        said = np.bincount(place, robust * lateral) / total
+        own = np.bincount(place, robust**2 * sigma**2 / np.maximum(share, _TINY)) / total / total
+        sure = 1.0 / (noise.drive_sigma**2 + 1.0 / total)
         if noise.drive_sigma > 0:
-            sure /= 1 + ((said - middle[cell // drives]) / (HALF_WEIGHT * 2 * noise.drive_sigma)) ** 2
-        weight = np.bincount(cell // drives, sure, minlength=count).astype(float)
-        offset = np.bincount(cell // drives, sure * said, minlength=count) / np.maximum(weight, np.finfo(float).tiny)
-        middle = offset
-    return offset, weight
+            sure /= 1 + ((said - middle[of_cell]) / (HALF_WEIGHT * 2 * noise.drive_sigma)) ** 2
+        weight = np.bincount(of_cell, sure, minlength=count).astype(float)
+        some = np.maximum(weight, _TINY)
+        offset = middle = np.bincount(of_cell, sure * said, minlength=count) / some
+        variance = np.bincount(of_cell, sure**2 * (noise.drive_sigma**2 + own), minlength=count) / some / some
+        error = np.where(weight > 0, np.sqrt(variance), np.inf)
+    return offset, weight, error
 
 
 def _noise_by_distance(looks: Looks, group: Index, feet: Feet, used: NDArray[np.bool_]) -> Array:

@@ -138,8 +138,8 @@ class _Tracks(NamedTuple):
 
     #: As looks of the drives.
     looks: Looks
-    #: The track of each station of the drives' lines, -1 where too few frames of the drive saw the line there, and which
-    #: point of the track it is.
+    #: The track of each station of the drives' lines, -1 where too few frames of the drive saw the line there, and
+    #: which point of the track it is.
     track: Index
     point: Index
 
@@ -155,7 +155,9 @@ def _tracks(state: _State, drives: Instances) -> _Tracks:
     return _drawn(lines, drive[axes.line[found.first]], drives, state.looks.unit, track, number)
 
 
-def _drawn(lines: NDArray[np.object_], drive: Index, drives: Instances, unit: float, track: Index, number: Index) -> _Tracks:
+def _drawn(
+    lines: NDArray[np.object_], drive: Index, drives: Instances, unit: float, track: Index, number: Index
+) -> _Tracks:
     """Return tracks from their lines; the numbers of the vertices become those of the points that answer to them."""
     looks = Looks.of(lines, drive, np.ones(len(lines)), drives, unit)
     last, points = shapely.get_num_coordinates(lines) - 1, np.bincount(looks.owner, minlength=len(lines))
@@ -165,7 +167,7 @@ def _drawn(lines: NDArray[np.object_], drive: Index, drives: Instances, unit: fl
 
 
 def _cut(tracks: _Tracks, joined: _State) -> _Tracks:
-    """Cut the tracks where too few drives saw the line that they are part of: there they may change from line to line."""
+    """Cut the tracks where too few drives saw the line that they are part of: there they may change over to another."""
     looks, axes = joined.looks, joined.fit.axes
     found = supported_stretches(axes, support(looks, joined.group, axes))
     piece = stretch_of(found, joined.fit.feet.station)

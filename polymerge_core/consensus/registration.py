@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from polymerge_core.consensus.fusion import CORRELATION, Fit
+from polymerge_core.consensus.fusion import CORRELATION, SHARED, Fit
 from polymerge_core.consensus.looks import Looks, cross
 from polymerge_core.curves import Array, Index
 
@@ -60,7 +60,7 @@ def equations(looks: Looks, fit: Fit, centre: Array) -> Normal:
     arm = looks.points[rows] - centre[instance]
     # How the distance to the left of the line changes with a shift east, a shift north, and a turn.
     change = np.column_stack([normal, cross(arm, normal)])
-    residual, sigma = fit.feet.lateral[rows], fit.sigma[rows]
+    residual, sigma = fit.feet.lateral[rows], np.hypot(fit.sigma[rows], SHARED * looks.unit)
     weight = looks.metres[rows] / (CORRELATION * looks.unit) / sigma**2 / (1 + (residual / (2 * sigma)) ** 2)
     matrix, target = np.zeros((count, 3, 3)), np.zeros((count, 3))
     for row in range(3):
