@@ -104,8 +104,8 @@ def judge(places: Array, pairs: Index, instances: Instances, square: float, driv
     passed = passed[np.bincount(inverse, chance) >= 1.0]
     sure = (seen_drives >= SURE)[passed // drives]
     share = np.isin(passed, seen_by)[sure].mean() if sure.any() else 1.0
-    expected_drives = float(share) * np.bincount(passed // drives, minlength=len(places))
-    return Support(seen, expected, seen_drives, expected_drives)
+    passes = np.bincount(passed // drives, minlength=len(places)).astype(np.float64)
+    return Support(seen, expected, seen_drives, share * passes)
 
 
 def _chances(
