@@ -10,6 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import LineString, Polygon, box
+from shapely.ops import substring
 
 import polymerge_core as pm
 from benchmarks.scenarios import town
@@ -487,3 +488,17 @@ def merge_crossings(shapes, footprints):
     names = np.arange(len(shapes))
     layer = looks(*(shape.exterior for shape in shapes), cls="ped_crossing", instance=names)
     return merge(local_maps(layer, footprints))
+
+
+@settings(max_examples=12, deadline=None)
+@given(SEEDS, st.floats(0.2, 0.8))
+def test_a_look_cut_in_two_leaves_the_map_as_it_was(seed, share):
+    layer = drawn(seed)
+    row = seed % len(layer)
+    whole = layer.geometry.iloc[row]
+    halves = layer.iloc[[row, row]].set_geometry([substring(whole, *ends, True) for ends in ((0, share), (share, 1))])
+    cut = pd.concat([layer.drop(index=layer.index[row]), halves], ignore_index=True)
+    expected, found = merge(layer).elements, merge(cut).elements
+    assert len(found) == len(expected)
+    # Its points lie elsewhere along it.
+    assert apart(found, expected) < 2 * CENTIMETRE
