@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from polymerge_core.consensus.association import Links, link_groups
 from polymerge_core.consensus.fusion import HALF_WEIGHT
+from polymerge_core.consensus.known import KnownAreas, nothing_known
 from polymerge_core.consensus.looks import Instances
-from polymerge_core.consensus.support import judge
+from polymerge_core.consensus.support import Support, judge
 from polymerge_core.curves import Array, Index
 
 #: Looks belong together where they have this share of the smaller one in common, in the mean.
@@ -55,6 +56,8 @@ class Areas(NamedTuple):
         Local maps that saw each, and that should have; 0 where footprints are not known.
     element : ndarray of int, shape (n,)
         The merged area of each look; -1 where it was left out.
+    known : KnownAreas
+        What is known of all areas, also of those that too few saw so far.
     """
 
     shapes: NDArray[np.object_]
@@ -62,10 +65,16 @@ class Areas(NamedTuple):
     seen: Array
     expected: Array
     element: Index
+    known: KnownAreas
 
 
 def merge_looks_at_areas(
-    polygons: NDArray[np.object_], instance: Index, weight: Array, instances: Instances, unit: float
+    polygons: NDArray[np.object_],
+    instance: Index,
+    weight: Array,
+    instances: Instances,
+    unit: float,
+    before: KnownAreas | None = None,
 ) -> Areas:
     """Merge the looks at areas of one class.
 
@@ -81,26 +90,38 @@ def merge_looks_at_areas(
         The local maps.
     unit : float
         The proximity, metres.
+    before : KnownAreas, optional
+        What was known before.
 
     Returns
     -------
     Areas
-        In the order of their first looks.
+        In the order of their first looks; what was known before comes last.
     """
+    count = len(polygons)
+    before = before or nothing_known()
+    polygons = np.concatenate([polygons, before.polygons])
+    instance = np.concatenate([instance, np.full(len(before.polygons), instances.known)])
+    weight = np.concatenate([weight, before.weight])
     edges = _edges(instance, instances)
-    whole = held_whole(polygons, instance, instances, unit)
+    edges[count:] = None
+    whole = np.append(held_whole(polygons[:count], edges[:count], unit), before.whole)
     group = group_areas(polygons, instance, whole, unit)
     order = np.argsort(group, kind="stable")
-    members = np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
-    fused = [fuse_areas(polygons[row], weight[row], None if edges is None else edges[row], unit) for row in members]
+    members = np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if count + len(before.weight) else []
+    fused = [fuse_areas(polygons[row], weight[row], edges[row], whole[row], unit) for row in members]
     shapes = np.array([shape for shape, _ in fused], dtype=object)
     sigma = np.array([error for _, error in fused])
     pairs = np.unique(group * len(instances) + instance)
     places = shapely.get_coordinates(shapely.centroid(shapes))
     support = judge(places, pairs, instances, _SQUARE * unit)
+    past = np.zeros((len(shapes), len(Support._fields)))
+    np.add.at(past, group[count:], before.support)
+    support = Support._make(new + old for new, old in zip(support, past.T, strict=True))
     kept = support.enough
     number = np.where(kept, np.cumsum(kept) - 1, -1)
-    return Areas(shapes[kept], sigma[kept], support.seen[kept].astype(float), support.expected[kept], number[group])
+    known = KnownAreas(shapes, np.bincount(group, weight), np.bincount(group, whole) > 0, np.column_stack([*support]))
+    return Areas(shapes[kept], sigma[kept], support.seen[kept], support.expected[kept], number[group[:count]], known)
 
 
 def group_areas(polygons: NDArray[np.object_], instance: Index, whole: NDArray[np.bool_], unit: float) -> Index:
@@ -145,21 +166,24 @@ def _join_cut(
     return joined
 
 
-def held_whole(polygons: NDArray[np.object_], instance: Index, instances: Instances, unit: float) -> NDArray[np.bool_]:
+def held_whole(polygons: NDArray[np.object_], edges: NDArray[np.object_], unit: float) -> NDArray[np.bool_]:
     """Tell which looks do not end at the edge of what their local map looked at; all where that is not known."""
-    edges = _edges(instance, instances)
-    if edges is None:
-        return np.ones(len(polygons), dtype=bool)
-    return np.asarray(shapely.distance(edges, polygons) > _EDGE * unit)
+    return ~np.asarray(shapely.distance(edges, polygons) <= _EDGE * unit)
 
 
-def _edges(instance: Index, instances: Instances) -> NDArray[np.object_] | None:
-    """Return the edge of what the local map of each look looked at."""
-    return None if instances.footprint is None else shapely.boundary(instances.footprint[instance])
+def _edges(instance: Index, instances: Instances) -> NDArray[np.object_]:
+    """Return the edge of what the local map of each look looked at; None where that is not known."""
+    if instances.footprint is None:
+        return np.full(len(instance), None, dtype=object)
+    return np.asarray(shapely.boundary(instances.footprint[instance]), dtype=object)
 
 
 def fuse_areas(
-    polygons: NDArray[np.object_], weight: Array, edges: NDArray[np.object_] | None, unit: float
+    polygons: NDArray[np.object_],
+    weight: Array,
+    edges: NDArray[np.object_],
+    held: NDArray[np.bool_],
+    unit: float,
 ) -> tuple[shapely.Polygon, float]:
     """Merge the looks at one area.
 
@@ -169,8 +193,10 @@ def fuse_areas(
         Metres.
     weight : ndarray of float, shape (n,)
         How much each counts.
-    edges : ndarray of LineString, shape (n,), optional
-        Edge of what the local map of each looked at: what lies there is no corner.
+    edges : ndarray of LineString, shape (n,)
+        Edge of what the local map of each looked at: what lies there is no corner; None where it is not known.
+    held : ndarray of bool, shape (n,)
+        Whether each holds the area whole.
     unit : float
         The proximity, metres.
 
@@ -184,12 +210,11 @@ def fuse_areas(
     if len(polygons) == 1:
         return polygons[0], np.nan
     corners = [_corners(polygon, unit) for polygon in polygons]
-    true = [np.ones(len(each), bool) for each in corners]
-    if edges is not None:
-        true = [
-            shapely.distance(edge, shapely.points(each)) > _EDGE * unit
-            for edge, each in zip(edges, corners, strict=True)
-        ]
+    # Distances to an edge that is not known are NaN. Of what was known before no corner is sure if it was cut off.
+    true = [
+        ~(shapely.distance(edge, shapely.points(each)) <= _EDGE * unit) & (all_of_it | (edge is not None))
+        for edge, each, all_of_it in zip(edges, corners, held, strict=True)
+    ]
     whole = np.array([each.all() for each in true])
     outline, cut = _outline(polygons, corners, true, weight, whole)
     seen = np.full((len(corners), len(outline), 2), np.nan)

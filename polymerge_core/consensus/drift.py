@@ -75,7 +75,8 @@ def pulls(tracks: Looks, fit: Fit, drift: Drift) -> Pulls:
     drift : Drift
         By what they were shifted.
     """
-    rows = np.flatnonzero(fit.used)
+    # The map that was known before stays where it is.
+    rows = np.flatnonzero(fit.used & (tracks.point_instance != tracks.instances.known))
     owner = tracks.owner[rows]
     count = np.maximum(np.round(tracks.curves.length / (_STRETCH * tracks.unit)), 1)
     share = tracks.arc[rows] / tracks.curves.length[owner]

@@ -58,6 +58,8 @@ class Fit(NamedTuple):
         Standard deviation of a look's lateral error at each point, metres.
     drive_sigma : float
         Standard deviation of the lateral error that all looks of a drive share, metres.
+    knowledge : ndarray of float, shape (s,)
+        How much is known of each station: 1 / variance, 1 / m2, as it counts in the fit.
     error : ndarray of float, shape (s,)
         Standard error of each station, metres.
     """
@@ -67,6 +69,7 @@ class Fit(NamedTuple):
     used: NDArray[np.bool_]
     sigma: Array
     drive_sigma: float
+    knowledge: Array
     error: Array
 
 
@@ -105,7 +108,7 @@ def fuse(looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 
         The noise in it is estimated anew from the residuals.
     """
     line = group[looks.owner]
-    error = np.empty(0)
+    weight = error = np.empty(0)
     for _ in range(rounds):
         axes = axes.reaching(axes.feet(looks.points, line, looks.unit), line).spaced(looks.unit)
         feet, used = _feet(looks, axes, line)
@@ -115,7 +118,7 @@ def fuse(looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 
         axes = Axes(moved, axes.line).smoothed(weight)
     feet, used = _feet(looks, axes, line)
     sigma = _noise_by_distance(looks, group, feet, used)
-    return Fit(axes, feet, used, sigma, _noise_of_drives(looks, feet, used, sigma), error)
+    return Fit(axes, feet, used, sigma, _noise_of_drives(looks, feet, used, sigma), weight, error)
 
 
 def _feet(looks: Looks, axes: Axes, line: Index) -> tuple[Feet, NDArray[np.bool_]]:
@@ -133,20 +136,28 @@ def _offsets(looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, co
     of_cell = cell // drives
     share = looks.weight[looks.owner[rows]] * looks.metres[rows] / looks.unit
     information = share / (sigma**2 + (SHARED * looks.unit) ** 2)
+    known = looks.knowledge[rows]
+    before = np.isfinite(known)
+    # What was known is the outcome of many looks, that of all their drives: it neither strays nor shares their errors.
+    information = np.where(before, known * looks.metres[rows] / looks.unit, information)
+    sigma, share = np.where(before, 1.0, sigma), np.where(before, np.maximum(information, _TINY), share)
+    of_before = np.bincount(place, before) > 0
+    drive_sigma = np.where(of_before, 0.0, noise.drive_sigma)
     middle, scale = np.zeros(count), HALF_WEIGHT * sigma
     offset, weight, error = middle, middle, middle
     for _ in range(3):
-        robust = information / (1 + ((lateral - middle[station]) / scale) ** 2)
+        robust = information / (1 + np.where(before, 0.0, (lateral - middle[station]) / scale) ** 2)
         total = np.maximum(np.bincount(place, robust), _TINY)
         said = np.bincount(place, robust * lateral) / total
         own = np.bincount(place, robust**2 * sigma**2 / np.maximum(share, _TINY)) / total / total
-        sure = 1.0 / (noise.drive_sigma**2 + 1.0 / total)
+        sure = 1.0 / (drive_sigma**2 + 1.0 / total)
         if noise.drive_sigma > 0:
-            sure /= 1 + ((said - middle[of_cell]) / (HALF_WEIGHT * 2 * noise.drive_sigma)) ** 2
+            off = (said - middle[of_cell]) / (HALF_WEIGHT * 2 * noise.drive_sigma)
+            sure /= 1 + np.where(of_before, 0.0, off) ** 2
         weight = np.bincount(of_cell, sure, minlength=count).astype(float)
         some = np.maximum(weight, _TINY)
         offset = middle = np.bincount(of_cell, sure * said, minlength=count) / some
-        variance = np.bincount(of_cell, sure**2 * (noise.drive_sigma**2 + own), minlength=count) / some / some
+        variance = np.bincount(of_cell, sure**2 * (drive_sigma**2 + own), minlength=count) / some / some
         error = np.where(weight > 0, np.sqrt(variance), np.inf)
     return offset, weight, error
 
@@ -154,7 +165,7 @@ def _offsets(looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, co
 def _noise_by_distance(looks: Looks, group: Index, feet: Feet, used: NDArray[np.bool_]) -> Array:
     """Estimate the standard deviation of the lateral error at each point, linear in the distance from the vehicle."""
     size = np.bincount(group)[group]
-    judged = np.flatnonzero(used & (size >= 3)[looks.owner])
+    judged = np.flatnonzero(used & (size >= 3)[looks.owner] & np.isnan(looks.knowledge))
     least = _LEAST * looks.unit
     if len(judged) < _FEW:
         return np.full(len(used), FIRST_NOISE * looks.unit)
@@ -172,7 +183,7 @@ def _noise_by_distance(looks: Looks, group: Index, feet: Feet, used: NDArray[np.
 
 def _noise_of_drives(looks: Looks, feet: Feet, used: NDArray[np.bool_], sigma: Array) -> float:
     """Estimate the standard deviation of the lateral error that the looks of a drive share; 0 where one drove alone."""
-    rows = np.flatnonzero(used)
+    rows = np.flatnonzero(used & np.isnan(looks.knowledge))
     drive = looks.instances.drive[looks.point_instance[rows]]
     drives = int(drive.max(initial=0)) + 1
     cell, place, number = np.unique(feet.station[rows] * drives + drive, return_inverse=True, return_counts=True)

@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 
 from polymerge_core.curves import Array, Curves, Index, count_up
 
+#: What is known of a place of a line: 1 / variance, 1 / m2, as it counts in a fit; the local maps that saw it, and that
+#: should have; the drives that saw it, and that should have.
+PAST = ("knowledge", "seen", "expected", "seen_drives", "expected_drives")
+
 #: Directions are taken over this many proximities to either side.
 _HALF_CHORD = 1.5
 
@@ -32,15 +36,28 @@ class Instances:
         Where each was taken, metres; NaN where it is not known.
     heading : ndarray of float, shape (k,)
         Direction of each, radians counter-clockwise from x; NaN where it is not known.
+    known : int, optional
+        The row that stands for the map that was known before, a drive of its own; -1 if there was none.
     """
 
     drive: Index
     footprint: NDArray[np.object_] | None
     position: Array
     heading: Array
+    known: int = -1
 
     def __len__(self) -> int:
         return len(self.drive)
+
+    def with_known(self, area: shapely.Geometry | None) -> Instances:
+        """Return the local maps and, as the last one, the map that was known before; `area` is what it covers."""
+        footprint = None
+        if self.footprint is not None and area is not None:
+            footprint = np.append(self.footprint, np.array([area], dtype=object))
+            shapely.prepare(footprint)
+        drive = np.append(self.drive, int(self.drive.max(initial=-1)) + 1)
+        position = np.vstack([self.position, [np.nan, np.nan]])
+        return Instances(drive, footprint, position, np.append(self.heading, np.nan), len(self))
 
     def by_drive(self) -> Instances:
         """Return the drives, each as one local map that looked wherever any of its frames did."""
@@ -52,7 +69,8 @@ class Instances:
             footprint = np.array([shapely.union_all(part) for part in parts], dtype=object)
             shapely.prepare(footprint)
         unknown = np.full(count, np.nan)
-        return Instances(np.arange(count), footprint, np.column_stack([unknown, unknown]), unknown)
+        known = -1 if self.known < 0 else int(self.drive[self.known])
+        return Instances(np.arange(count), footprint, np.column_stack([unknown, unknown]), unknown, known)
 
 
 @dataclass(frozen=True)
@@ -77,6 +95,8 @@ class Looks:
         Where each point lies along its look, and how much of it it stands for, metres.
     points, tangent : ndarray of float, shape (p, 2)
         The points, moved by what registration found, and the direction of their look there.
+    past : ndarray of float, shape (p, 5)
+        Of points of the map that was known before, what `PAST` names; NaN for all others.
     """
 
     curves: Curves
@@ -89,6 +109,7 @@ class Looks:
     metres: Array
     points: Array
     tangent: Array
+    past: Array
 
     @classmethod
     def of(cls, lines: NDArray[np.object_], instance: Index, weight: Array, instances: Instances, unit: float) -> Looks:
@@ -101,10 +122,16 @@ class Looks:
         arc = number * (curves.length / (counts - 1))[owner]
         tangent = direction_at(curves, owner, arc, _HALF_CHORD * unit)
         metres = (curves.length / counts)[owner]
-        return cls(curves, instance, weight, instances, unit, owner, arc, metres, points, tangent)
+        unknown = np.full((len(owner), len(PAST)), np.nan)
+        return cls(curves, instance, weight, instances, unit, owner, arc, metres, points, tangent, unknown)
 
     def __len__(self) -> int:
         return len(self.curves)
+
+    @property
+    def knowledge(self) -> Array:
+        """How much was known of each point before, 1 / m2; NaN where it is new."""
+        return self.past[:, 0]
 
     @property
     def point_instance(self) -> Index:
@@ -123,6 +150,18 @@ class Looks:
         tangent = direction_at(curves, self.owner, curves.arc, _HALF_CHORD * self.unit)
         metres = (curves.length / np.bincount(self.owner, minlength=len(curves)))[self.owner]
         return replace(self, curves=curves, arc=curves.arc, metres=metres, tangent=tangent)
+
+    def and_also(self, other: Looks) -> Looks:
+        """Return these looks and others of the same local maps."""
+        curves = Curves(np.concatenate([self.curves.lines, other.curves.lines]))
+        owner = np.concatenate([self.owner, len(self) + other.owner])
+        names = ("instance", "weight", "arc", "metres", "points", "tangent", "past")
+        both = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
+        return Looks(curves=curves, instances=self.instances, unit=self.unit, owner=owner, **both)
+
+    def remembering(self, past: Array) -> Looks:
+        """Return the same looks with what is known of their points."""
+        return replace(self, past=past)
 
     def moved(self, points: Array) -> Looks:
         """Return the same looks with their points elsewhere."""

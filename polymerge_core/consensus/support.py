@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from polymerge_core.consensus.axes import Axes
+from polymerge_core.consensus.axes import LINE_APART, Axes
 from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.membership import points_beside, sightings
 from polymerge_core.curves import Array, Index
@@ -33,6 +34,9 @@ _SQUARE = 5.0
 
 #: Gaps up to this many proximities are bridged: a predictor draws one line in two pieces.
 _BRIDGED = 5
+
+#: What was known before counts at stations that its lines pass within so many proximities.
+_NEAR = 1.5
 
 #: What trimming leaves of a line must be this long, proximities.
 _SHORT = 3
@@ -67,7 +71,22 @@ def support(looks: Looks, group: Index, axes: Axes, drive: Index | None = None) 
     pairs = _sightings(looks, group, axes)
     of_station = None if drive is None else drive[axes.line]
     found = judge(axes.stations, pairs, looks.instances, _SQUARE * looks.unit, of_station)
-    return Support._make(axes.around(column) for column in found)
+    before = _before(looks, group, axes)
+    return Support._make(axes.around(new + old) for new, old in zip(found, before.T, strict=True))
+
+
+def _before(looks: Looks, group: Index, axes: Axes) -> Array:
+    """Return who saw each station of the map that was known before, and who should have, shape (s, 4)."""
+    counts = np.zeros((len(axes.line), len(Support._fields)))
+    rows = np.flatnonzero(np.isfinite(looks.knowledge))
+    if len(rows) == 0:
+        return counts
+    tree = cKDTree(np.column_stack([looks.points[rows], LINE_APART * group[looks.owner[rows]]]))
+    there = np.column_stack([axes.stations, LINE_APART * axes.line])
+    distance, nearest = tree.query(there, distance_upper_bound=_NEAR * looks.unit, workers=-1)
+    near = np.isfinite(distance)
+    counts[near] = looks.past[rows[nearest[near]], 1:]
+    return counts
 
 
 def judge(places: Array, pairs: Index, instances: Instances, square: float, drive: Index | None = None) -> Support:
@@ -87,12 +106,14 @@ def judge(places: Array, pairs: Index, instances: Instances, square: float, driv
         Only local maps of this drive are expected to see the place.
     """
     count, drives = len(instances), int(instances.drive.max(initial=-1)) + 1
+    pairs = pairs[pairs % count != instances.known] if instances.known >= 0 else pairs
     seen = np.bincount(pairs // count, minlength=len(places)) if len(pairs) else np.zeros(len(places), np.intp)
     seen_by = np.unique(pairs // count * drives + instances.drive[pairs % count])
     seen_drives = np.bincount(seen_by // drives, minlength=len(places)) if len(pairs) else seen
     if instances.footprint is None or len(places) == 0:
         return Support(seen, np.zeros(len(places)), seen_drives, np.zeros(len(places)))
     instance, place = shapely.STRtree(shapely.points(places)).query(instances.footprint, predicate="contains")
+    instance, place = instance[instance != instances.known], place[instance != instances.known]
     if drive is not None:
         own = instances.drive[instance] == drive[place]
         instance, place = instance[own], place[own]
@@ -145,7 +166,11 @@ def _sightings(looks: Looks, group: Index, axes: Axes) -> Index:
 
 def supported_stretches(axes: Axes, support: Support) -> Stretches:
     """Return the stretches of the lines that enough local maps saw, short gaps bridged."""
-    kept = (support.seen > 0) & support.enough
+    return stretches_of(axes, (support.seen > 0) & support.enough)
+
+
+def stretches_of(axes: Axes, kept: NDArray[np.bool_]) -> Stretches:
+    """Return the stretches of the lines that are to be kept, short gaps bridged."""
     rows = np.flatnonzero(kept)
     if len(rows) == 0:
         empty = np.empty(0, np.intp)
@@ -166,3 +191,15 @@ def stretch_of(stretches: Stretches, station: Index) -> NDArray[np.intp]:
     place = np.searchsorted(stretches.first, station, side="right") - 1
     inside = (place >= 0) & (station <= stretches.last[place])
     return np.where(inside, place, -1)
+
+
+def shapes_of(stations: Array, stretches: Stretches, tolerance: float) -> NDArray[np.object_]:
+    """Return stretches as lines without vertices that leave them where they are within a tolerance, metres."""
+    size = stretches.last - stretches.first + 1
+    owner = np.repeat(np.arange(len(size)), size)
+    rows = np.arange(len(owner)) - np.repeat(np.cumsum(size) - size, size) + stretches.first[owner]
+    if len(owner) == 0:
+        return np.empty(0, dtype=object)
+    drawn = shapely.linestrings(stations[rows], indices=owner)
+    shapes: NDArray[np.object_] = shapely.simplify(drawn, tolerance)
+    return shapes
