@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import geopandas as gpd
 import numpy as np
@@ -28,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import polymerge_core as pm
 from benchmarks import rivals
-from benchmarks.noise import CLASS_NAMES
+from benchmarks.noise import CLASS_NAMES, Noise
 from benchmarks.scenarios import Scenario, av2_scenarios, held_whole, town
 from polymerge_core.options import METHODS
 from polymerge_core.schema import AREA_CLASSES
@@ -55,7 +56,9 @@ n elements; DF discrete Frechet distance to the best match, m; AP mean average p
 of 0.5, 1.0 and 1.5 m; F1 by length within 0.5 m and 1.0 m, recall within 1.0 m; dupl times that a place is drawn; fragm
 elements along one true element; zigzag turning, rad/m, and that of the true map; lateral median error, m; IoU of areas;
 s seconds for all classes of a scenario. Means over the runs."""
-COLUMNS = ("n", *MEASURES, "s")
+#: Takes seconds a map, so that only who asks for it gets it.
+PCM = {"PCM": "pcm_best"}
+COLUMNS = ("n", *MEASURES, *PCM, "s")
 
 
 @dataclass(frozen=True)
@@ -138,21 +141,24 @@ def draw_all(scenarios: Iterable[Scenario], peers: Sequence[Peer] = PEERS) -> li
     return found
 
 
-def measure(scenarios: Sequence[Scenario], maps: Sequence[Mapping[str, Drawn]]) -> pd.DataFrame:
+def measure(scenarios: Iterable[Scenario], maps: Sequence[Mapping[str, Drawn]], *, pcm: bool = False) -> pd.DataFrame:
     """Measure maps against the true maps.
 
     Parameters
     ----------
-    scenarios : sequence of Scenario
+    scenarios : iterable of Scenario
         Local maps over true maps.
     maps : sequence of mapping
         For each scenario what came of each peer, by its name.
+    pcm : bool, default False
+        Whether to work out the partial curve mapping too.
 
     Returns
     -------
     DataFrame
         One row a scenario, peer and class of the truth: `run` (number of the scenario), `scenario`, `peer`, `class`,
-        `n`, the columns of `MEASURES`, `s`, `reason`. NaN where there is no map, or it leaves areas out.
+        `n`, the columns of `MEASURES`, and of `PCM` where asked, `s`, `reason`. NaN where there is no map, or it leaves
+        areas out.
     """
     rows = []
     for run, (scenario, drawn) in enumerate(zip(scenarios, maps, strict=True)):
@@ -160,25 +166,54 @@ def measure(scenarios: Sequence[Scenario], maps: Sequence[Mapping[str, Drawn]]) 
             rows += [
                 {"run": run, "scenario": scenario.name, "peer": peer, "class": name, **values}
                 | {"s": made.seconds, "reason": made.reason}
-                for name, values in _figures(scenario, made).items()
+                for name, values in _figures(scenario, made, pcm=pcm).items()
             ]
     figures: pd.DataFrame = pd.DataFrame(rows)
     return figures
 
 
-def _figures(scenario: Scenario, made: Drawn) -> dict[str, dict[str, float]]:
+def _figures(scenario: Scenario, made: Drawn, *, pcm: bool) -> dict[str, dict[str, float]]:
     """Return the figures of a map for each class of the truth."""
-    figures = {name: dict.fromkeys(["n", *MEASURES], np.nan) for name in CLASS_NAMES}
-    figures = {name: values for name, values in figures.items() if (scenario.truth["class"] == name).any()}
     if made.map is None:
-        return figures
-    result = pm.evaluate(made.map, scenario.truth, local_maps=scenario.local)
-    known = result.table.set_index(["class", "measure"])["value"].to_dict()
+        return {name: dict.fromkeys(["n", *MEASURES], np.nan) for name in _classes(scenario.truth)}
+    figures = figures_of(made.map, scenario.truth, scenario.local, pcm=pcm)
     for name, values in figures.items():
-        if made.areas or name not in AREA_CLASSES:
-            values["n"] = float((made.map["class"] == name).sum())
-            values |= {column: float(known.get((name, measure), np.nan)) for column, measure in MEASURES.items()}
+        if name in AREA_CLASSES and not made.areas:
+            values.update(dict.fromkeys(values, np.nan))
     return figures
+
+
+def figures_of(
+    layer: gpd.GeoDataFrame, truth: gpd.GeoDataFrame, local: list[pm.LocalMaps], *, pcm: bool = False
+) -> dict[str, dict[str, float]]:
+    """Measure one map against the true map, where the local maps looked.
+
+    Parameters
+    ----------
+    layer, truth : GeoDataFrame
+        The map and the true map.
+    local : list of LocalMaps
+        What was seen.
+    pcm : bool, default False
+        Whether to work out the partial curve mapping.
+
+    Returns
+    -------
+    dict
+        For each class of the truth `n` and the columns of `MEASURES`, and of `PCM` where asked.
+    """
+    result = pm.evaluate(layer, truth, local_maps=local, pcm=pcm)
+    known = result.table.set_index(["class", "measure"])["value"].to_dict()
+    measures = MEASURES | (PCM if pcm else {})
+    return {
+        name: {"n": float((layer["class"] == name).sum())}
+        | {column: float(known.get((name, measure), np.nan)) for column, measure in measures.items()}
+        for name in _classes(truth)
+    }
+
+
+def _classes(truth: gpd.GeoDataFrame) -> list[str]:
+    return [name for name in CLASS_NAMES if (truth["class"] == name).any()]
 
 
 def table(figures: pd.DataFrame) -> str:
@@ -196,7 +231,7 @@ def table(figures: pd.DataFrame) -> str:
     """
     parts = []
     for name, rows in figures.groupby("class", sort=False):
-        columns = [column for column in COLUMNS if rows[column].notna().any()]
+        columns = [column for column in COLUMNS if column in rows and rows[column].notna().any()]
         head = f"{'':<20}" + "".join(f"{column:>8}" for column in columns)
         lines = [f"{peer:<20}" + _row(runs, columns) for peer, runs in rows.groupby("peer", sort=False)]
         parts.append("\n".join([str(name), head, *lines]))
@@ -221,24 +256,49 @@ def _cell(column: object, value: float) -> str:
     return f"{value:8.1f}" if column == "n" else f"{value:8.3f}" if value < 0.1 else f"{value:8.2f}"
 
 
-def main() -> int:
-    """Run the command line; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def command_line(description: str, names: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the command line of a comparison of some peers, by name."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--data", type=Path, help="folder of the real data; the simulated town without it")
     parser.add_argument("--seeds", type=int, help="how many seeds of the simulated errors (3 with --data, else 1)")
-    parser.add_argument("--only", nargs="+", choices=[peer.name for peer in PEERS], help="these peers alone")
+    parser.add_argument("--only", nargs="+", choices=names, help="of the peers these alone")
     parser.add_argument("-o", "--output", type=Path, help="JSON file for the figures of every run")
-    chosen = parser.parse_args()
-    seeds = range(1, 1 + (chosen.seeds or (1 if chosen.data is None else 3)))
-    runs = [[town(seed)] if chosen.data is None else av2_scenarios(chosen.data, seed=seed) for seed in seeds]
-    scenarios = [scenario for run in runs for scenario in run]
+    return parser
+
+
+def seeds_of(chosen: argparse.Namespace) -> range:
+    """Return the seeds of the simulated errors that the command line asks for."""
+    return range(1, 1 + (chosen.seeds or (1 if chosen.data is None else 3)))
+
+
+def simulated(data: Path | None, seeds: Iterable[int], noise: Noise | None = None) -> list[Scenario]:
+    """Return the scenarios of all seeds: those in the folder of the real data, or the town where none is given."""
+    runs = [[town(seed, noise)] if data is None else av2_scenarios(data, seed=seed, noise=noise) for seed in seeds]
+    return [scenario for run in runs for scenario in run]
+
+
+def described(scenarios: Sequence[Scenario], seeds: Sequence[int]) -> str:
+    """Say what the means are over."""
+    names = ", ".join(dict.fromkeys(scenario.name for scenario in scenarios))
+    return f"{names}; {len(seeds)} seeds; {len(scenarios)} runs"
+
+
+def records(figures: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of a table ready for JSON, which knows no NaN."""
+    known = figures.astype(object).where(figures.notna(), None).to_dict("records")
+    return [{str(column): value for column, value in row.items()} for row in known]
+
+
+def main() -> int:
+    """Run the command line; return the exit status."""
+    chosen = command_line(__doc__.splitlines()[0], [peer.name for peer in PEERS]).parse_args()
+    seeds = seeds_of(chosen)
+    scenarios = simulated(chosen.data, seeds)
     peers = [peer for peer in PEERS if not chosen.only or peer.name in chosen.only]
     figures = measure(scenarios, draw_all(scenarios, peers))
-    names = ", ".join(dict.fromkeys(scenario.name for scenario in scenarios))
-    print(f"{names}; {len(seeds)} seeds; {len(scenarios)} runs\n{LEGEND}\n\n{table(figures)}")
+    print(f"{described(scenarios, seeds)}\n{LEGEND}\n\n{table(figures)}")
     if chosen.output:
-        known = figures.astype(object).where(figures.notna(), None)
-        chosen.output.write_text(json.dumps(known.to_dict("records"), indent=1) + "\n", encoding="utf-8")
+        chosen.output.write_text(json.dumps(records(figures), indent=1) + "\n", encoding="utf-8")
     return 0
 
 

@@ -61,6 +61,41 @@ class Scenario:
         return gpd.GeoDataFrame(frame, crs=self.truth.crs)
 
 
+@dataclass(frozen=True)
+class Road:
+    """A true map and a way through it, on which frames can be simulated.
+
+    Attributes
+    ----------
+    truth : GeoDataFrame
+        The true map.
+    poses : DataFrame
+        True poses all along the way.
+    place : dict
+        Where the poses are: options of `polymerge_core.project`.
+    """
+
+    truth: gpd.GeoDataFrame
+    poses: pd.DataFrame
+    place: dict[str, Any]
+
+    def drive(
+        self,
+        name: str,
+        *,
+        seed: int,
+        noise: Noise | None = None,
+        count: int = FRAMES,
+        spacing: float = SPACING_M,
+        start: float = 0.0,
+    ) -> Scenario:
+        """Simulate a drive: what `count` frames see, `spacing` metres apart from `start` metres along the way on."""
+        poses = key_frames(self.poses, count, spacing, start=start)
+        offset = self.place.get("pose_offset", (0.0, 0.0))
+        drive = simulate(self.truth, poses, seed=seed, noise=noise, offset=offset)
+        return simulated_scenario(name, self.truth, drive, self.place)
+
+
 def held_whole(scenario: Scenario) -> pd.Series:
     """Tell of each observation whether it is a line, or a crossing that its frame's footprint holds whole.
 
@@ -105,14 +140,17 @@ def av2_scenarios(folder: Path, *, seed: int, noise: Noise | None = None) -> lis
         Named S1, S2 and S3.
     """
     starts = {"S1": (MIAMI, 0.0), "S2": (PITTSBURGH, 0.0), "S3": (PITTSBURGH, last_start(folder))}
-    found = []
-    for name, ((log, offset), start) in starts.items():
-        truth = gpd.read_file(folder / "av2" / log / "ground_truth.gpkg")
-        poses = key_frames(read_poses(folder / "av2" / log / "poses.csv"), FRAMES, SPACING_M, start=start)
-        drive = simulate(truth, poses, seed=seed, noise=noise, offset=offset)
-        place = {"crs": AV2_CRS, "pose_kind": "offset", "pose_offset": offset}
-        found.append(simulated_scenario(name, truth, drive, place))
-    return found
+    return [
+        av2_road(folder, log).drive(name, seed=seed, noise=noise, start=start) for name, (log, start) in starts.items()
+    ]
+
+
+def av2_road(folder: Path, log: tuple[str, tuple[float, float]]) -> Road:
+    """Return the road of `MIAMI` or `PITTSBURGH`, from the folder that `av2_scenarios` reads."""
+    name, offset = log
+    truth = gpd.read_file(folder / "av2" / name / "ground_truth.gpkg")
+    place = {"crs": AV2_CRS, "pose_kind": "offset", "pose_offset": offset}
+    return Road(truth, read_poses(folder / "av2" / name / "poses.csv"), place)
 
 
 def last_start(folder: Path) -> float:
@@ -129,9 +167,13 @@ def overlap(folder: Path) -> float:
 
 def town(seed: int, noise: Noise | None = None) -> Scenario:
     """Return 20 frames of a drive through the simulated town junction."""
-    truth, poses = town_truth(), key_frames(town_drive(), 20)
-    drive = simulate(truth, poses, seed=seed, noise=noise)
-    return simulated_scenario("town", truth, drive, {"crs": str(truth.crs)})
+    return town_road().drive("town", seed=seed, noise=noise, count=20)
+
+
+def town_road() -> Road:
+    """Return the simulated town junction and the drive through it."""
+    truth = town_truth()
+    return Road(truth, town_drive(), {"crs": str(truth.crs)})
 
 
 def simulated_scenario(name: str, truth: gpd.GeoDataFrame, drive: SimulatedDrive, place: dict[str, Any]) -> Scenario:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from polymerge_core.consensus.axes import LINE_APART
 from polymerge_core.consensus.fusion import HALF_WEIGHT, Fit
-from polymerge_core.consensus.looks import Looks
+from polymerge_core.consensus.looks import DRIVES, Looks
 from polymerge_core.curves import Array, Index
 
 #: Standard deviation that is held likely of a drive's shift, proximities.
@@ -61,6 +61,8 @@ class Pulls(NamedTuple):
     #: How far to that side the drive should be shifted, metres, and the variance of that.
     by: Array
     variance: Array
+    #: The drives that the line is the mean of: one, but for those of the map that was known before.
+    drives: Array
 
 
 def pulls(tracks: Looks, fit: Fit, drift: Drift) -> Pulls:
@@ -75,8 +77,7 @@ def pulls(tracks: Looks, fit: Fit, drift: Drift) -> Pulls:
     drift : Drift
         By what they were shifted.
     """
-    # The map that was known before stays where it is.
-    rows = np.flatnonzero(fit.used & (tracks.point_instance != tracks.instances.known))
+    rows = np.flatnonzero(fit.used)
     owner = tracks.owner[rows]
     count = np.maximum(np.round(tracks.curves.length / (_STRETCH * tracks.unit)), 1)
     share = tracks.arc[rows] / tracks.curves.length[owner]
@@ -96,7 +97,8 @@ def pulls(tracks: Looks, fit: Fit, drift: Drift) -> Pulls:
     residual, sigma = mean(fit.feet.lateral[rows]), np.sqrt(mean(fit.sigma[rows] ** 2))
     before = (normal * drift.at(drive, place)).sum(axis=1)
     variance = sigma**2 * (1 + (residual / (HALF_WEIGHT * sigma)) ** 2)
-    return Pulls(drive, place, normal, before - residual, variance)
+    drives = np.maximum(mean(np.nan_to_num(tracks.past[rows, DRIVES], nan=1.0)), 1.0)
+    return Pulls(drive, place, normal, before - residual, variance, drives)
 
 
 def estimate_drift(pulls: list[Pulls], unit: float) -> Drift:
@@ -115,10 +117,12 @@ def estimate_drift(pulls: list[Pulls], unit: float) -> Drift:
     reach = _RANGE * unit
     alike = _kernel(every.drive, every.place, every.drive, every.place, reach).tocoo()
     together = (every.normal[alike.row] * every.normal[alike.col]).sum(axis=1)
-    likely = (_SHIFT * unit) ** 2
-    matrix = csr_array((likely * together * alike.data, (alike.row, alike.col)), shape=alike.shape)
-    solved = spsolve((matrix + diags_array(every.variance)).tocsc(), every.by)
-    return Drift(every.drive, every.place, likely * np.atleast_1d(solved)[:, None] * every.normal, reach)
+    # The mean of several drives strays less.
+    likely = _SHIFT * unit / np.sqrt(every.drives)
+    covariance = likely[alike.row] * likely[alike.col] * together * alike.data
+    matrix = csr_array((covariance, (alike.row, alike.col)), shape=alike.shape)
+    solved = np.atleast_1d(spsolve((matrix + diags_array(every.variance)).tocsc(), every.by))
+    return Drift(every.drive, every.place, (likely**2 * solved)[:, None] * every.normal, reach)
 
 
 def _kernel(drive: Index, points: Array, others: Index, places: Array, reach: float) -> csr_array:

@@ -19,7 +19,6 @@ from polymerge_core.consensus.fusion import Noise, fuse
 from polymerge_core.consensus.known import remembering
 from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.membership import line_along
-from polymerge_core.consensus.registration import corrected
 from polymerge_core.consensus.support import shapes_of, stretch_of, support, supported_stretches
 from polymerge_core.consensus.tracing import State, moved, trace
 from polymerge_core.curves import Array, Index
@@ -61,12 +60,22 @@ def join_drives(states: list[State], centre: Array) -> tuple[list[State], Array]
         drift = estimate_drift([pulls(each.looks, each.fit, drift) for each in joined if each], unit)
         if number + 1 < _DRIFTS:
             tracks = [_cut(each, one) if one else each for each, one in zip(tracks, joined, strict=True)]
-    correction = np.column_stack([drift.at(instances.drive, centre), np.zeros(len(centre))])
+    shift = drift.at(instances.drive, centre)
+    followed = [_follow(state, shift, drift) for state in states]
     found = [
-        _of_all_drives(state, each, one, correction, centre) if one else moved(state, correction, centre)
-        for state, each, one in zip(states, tracks, joined, strict=True)
+        _of_all_drives(state, each, one) if one else moved(state, np.zeros((len(centre), 3)), centre)
+        for state, each, one in zip(followed, tracks, joined, strict=True)
     ]
-    return found, correction[:, :2]
+    return found, shift
+
+
+def _follow(state: State, shift: Array, drift: Drift) -> State:
+    """Shift the looks: each local map as a whole, what was known before place by place."""
+    looks = state.looks
+    by = shift[looks.point_instance]
+    known = np.flatnonzero(looks.point_instance == looks.instances.known)
+    by[known] = drift.at(looks.instances.drive[looks.point_instance[known]], looks.points[known])
+    return state._replace(looks=looks.moved(looks.points + by))
 
 
 class _Tracks(NamedTuple):
@@ -161,9 +170,9 @@ def _traced(tracks: _Tracks, drift: Drift) -> State | None:
     return trace(looks.moved(points).redrawn(), np.zeros(len(looks), np.intp))
 
 
-def _of_all_drives(state: State, tracks: _Tracks, joined: State, correction: Array, centre: Array) -> State:
+def _of_all_drives(state: State, tracks: _Tracks, joined: State) -> State:
     """Give the looks of the frames to the lines of all drives; what is on no track stays a line of its own."""
-    looks = corrected(state.looks, correction, centre)
+    looks = state.looks
     axes, track = joined.fit.axes, _track_of_looks(state, tracks)
     on_track = track >= 0
     group = line_along(looks, axes)

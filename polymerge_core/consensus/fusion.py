@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polymerge_core.consensus.alongside import REACH
 from polymerge_core.consensus.axes import Axes, Feet
-from polymerge_core.consensus.looks import Looks
+from polymerge_core.consensus.looks import DRIVES, Looks
 from polymerge_core.curves import Array, Index
 
 #: The errors along a look are alike over this many proximities, so that it counts as one measurement over each of them.
@@ -59,7 +59,7 @@ class Fit(NamedTuple):
     drive_sigma : float
         Standard deviation of the lateral error that all looks of a drive share, metres.
     knowledge : ndarray of float, shape (s,)
-        How much is known of each station: 1 / variance, 1 / m2, as it counts in the fit.
+        How much the looks say of each station: 1 / variance, 1 / m2, but for what drives share.
     error : ndarray of float, shape (s,)
         Standard error of each station, metres.
     """
@@ -108,17 +108,17 @@ def fuse(looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 
         The noise in it is estimated anew from the residuals.
     """
     line = group[looks.owner]
-    weight = error = np.empty(0)
+    knowledge = error = np.empty(0)
     for _ in range(rounds):
         axes = axes.reaching(axes.feet(looks.points, line, looks.unit), line).spaced(looks.unit)
         feet, used = _feet(looks, axes, line)
-        offset, weight, error = map(axes.around, _offsets(looks, feet, used, noise, len(axes.line)))
+        offset, weight, error, knowledge = map(axes.around, _offsets(looks, feet, used, noise, len(axes.line)))
         # Rounding must not open a ring.
         moved = axes.around(axes.stations + offset[:, None] * axes.normal)
         axes = Axes(moved, axes.line).smoothed(weight)
     feet, used = _feet(looks, axes, line)
     sigma = _noise_by_distance(looks, group, feet, used)
-    return Fit(axes, feet, used, sigma, _noise_of_drives(looks, feet, used, sigma), weight, error)
+    return Fit(axes, feet, used, sigma, _noise_of_drives(looks, feet, used, sigma), knowledge, error)
 
 
 def _feet(looks: Looks, axes: Axes, line: Index) -> tuple[Feet, NDArray[np.bool_]]:
@@ -126,8 +126,10 @@ def _feet(looks: Looks, axes: Axes, line: Index) -> tuple[Feet, NDArray[np.bool_
     return feet, feet.beside & (np.abs(feet.lateral) <= 2 * REACH * looks.unit)
 
 
-def _offsets(looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, count: int) -> tuple[Array, Array, Array]:
-    """Return how far to the left of each station its looks lie, how much they count, and the standard error of that."""
+def _offsets(
+    looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, count: int
+) -> tuple[Array, Array, Array, Array]:
+    """Return how far to the left of each station its looks lie, how much they count, its error, and what is known."""
     rows = np.flatnonzero(used)
     station, lateral, sigma = feet.station[rows], feet.lateral[rows], noise.sigma[rows]
     drive = looks.instances.drive[looks.point_instance[rows]]
@@ -138,13 +140,15 @@ def _offsets(looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, co
     information = share / (sigma**2 + (SHARED * looks.unit) ** 2)
     known = looks.knowledge[rows]
     before = np.isfinite(known)
-    # What was known is the outcome of many looks, that of all their drives: it neither strays nor shares their errors.
+    # What was known is the outcome of many looks, and of so many drives: no single one that could stray.
     information = np.where(before, known * looks.metres[rows] / looks.unit, information)
     sigma, share = np.where(before, 1.0, sigma), np.where(before, np.maximum(information, _TINY), share)
-    of_before = np.bincount(place, before) > 0
-    drive_sigma = np.where(of_before, 0.0, noise.drive_sigma)
+    of_before = np.bincount(place, before)
+    drives_before = np.bincount(place, np.where(before, looks.past[rows, DRIVES], 0.0)) / np.maximum(of_before, 1.0)
+    of_before = of_before > 0
+    drive_sigma = noise.drive_sigma / np.sqrt(np.maximum(drives_before, 1.0))
     middle, scale = np.zeros(count), HALF_WEIGHT * sigma
-    offset, weight, error = middle, middle, middle
+    offset, weight, error, knowledge = middle, middle, middle, middle
     for _ in range(3):
         robust = information / (1 + np.where(before, 0.0, (lateral - middle[station]) / scale) ** 2)
         total = np.maximum(np.bincount(place, robust), _TINY)
@@ -159,7 +163,8 @@ def _offsets(looks: Looks, feet: Feet, used: NDArray[np.bool_], noise: Noise, co
         offset = middle = np.bincount(of_cell, sure * said, minlength=count) / some
         variance = np.bincount(of_cell, sure**2 * (drive_sigma**2 + own), minlength=count) / some / some
         error = np.where(weight > 0, np.sqrt(variance), np.inf)
-    return offset, weight, error
+        knowledge = np.bincount(of_cell, total, minlength=count).astype(float)
+    return offset, weight, error, knowledge
 
 
 def _noise_by_distance(looks: Looks, group: Index, feet: Feet, used: NDArray[np.bool_]) -> Array:

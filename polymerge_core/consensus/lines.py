@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polymerge_core.consensus.drives import join_drives
 from polymerge_core.consensus.known import KnownLines, known_lines
-from polymerge_core.consensus.looks import Looks
+from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.registration import centres, corrections, equations
 from polymerge_core.consensus.support import Stretches, Support, shapes_of, stretch_of, support, supported_stretches
 from polymerge_core.consensus.tracing import State, moved, trace
@@ -89,12 +89,18 @@ def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tup
         for state in states[1:]:
             total = total.add(equations(state.looks, state.fit, centre))
         step = corrections(total, corrected, unit)
-        if instances.known >= 0:
-            step[instances.known] = 0.0
+        step = _of_their_own(step, instances)
         states = [moved(state, step, centre) for state in states]
         corrected += step
         advance(0.6 + 0.35 * (number + 1) / _CORRECTIONS)
     return [_finish(state) for state in states], shifted + corrected
+
+
+def _of_their_own(step: Array, instances: Instances) -> Array:
+    """Return corrections without what those of a drive have in common, which is the drive's, and with none of the map."""
+    count = np.maximum(np.bincount(instances.drive), 1)
+    common = np.column_stack([np.bincount(instances.drive, column) for column in step.T]) / count[:, None]
+    return step - common[instances.drive]
 
 
 def _finish(state: State) -> Lines:

@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 from polymerge_core.curves import Array, Curves, Index, count_up
 
-#: What is known of a place of a line: 1 / variance, 1 / m2, as it counts in a fit; the local maps that saw it, and that
-#: should have; the drives that saw it, and that should have.
+#: What is known of a place of a line: 1 / variance, 1 / m2, but for what drives share; the local maps that saw it, and
+#: that should have; the drives that saw it, and that should have.
 PAST = ("knowledge", "seen", "expected", "seen_drives", "expected_drives")
+
+#: The column of the drives that saw it.
+DRIVES = PAST.index("seen_drives")
 
 #: Directions are taken over this many proximities to either side.
 _HALF_CHORD = 1.5

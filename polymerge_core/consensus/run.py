@@ -6,20 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import geopandas as gpd
 import numpy as np
 import pandas as pd
-import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from polymerge_core.consensus.areas import Areas, merge_looks_at_areas
+from polymerge_core.consensus.areas import Areas
+from polymerge_core.consensus.given import read_looks
 from polymerge_core.consensus.lines import Lines, merge_lines
-from polymerge_core.consensus.looks import Instances, Looks
-from polymerge_core.consensus.registration import centres, moved_by
-from polymerge_core.crs import transform_coordinates
+from polymerge_core.consensus.looks import Looks
 from polymerge_core.curves import Array, Curves, Index
-from polymerge_core.errors import InputError
 from polymerge_core.observations import MIN_SEGMENT_M, Observations
 from polymerge_core.options import Options
 from polymerge_core.schema import LEFT_OUT_COLUMNS, LocalMaps
@@ -27,12 +23,6 @@ from polymerge_core.sets import ElementSets
 
 #: Why a piece of an observation is in no element.
 UNSUPPORTED = "seen by too few of the local maps that looked there"
-
-#: More steps than this along all observations are a proximity that is too small for them (some 500 bytes each).
-MOST_POINTS = 20_000_000
-
-#: A score of 0 still counts this much, so that something comes of observations that all have it.
-_LEAST_WEIGHT = 1e-3
 
 #: An observation is not cut into pieces shorter than this, proximities.
 _PIECE = 2.0
@@ -98,88 +88,22 @@ def merge_by_consensus(
     InputError
         If the proximity is too small for so much length.
     """
-    table = observations.table
-    points = float(table.loc[~table["is_area"], "length_m"].sum()) / options.proximity
-    if points > MOST_POINTS:
-        raise InputError(
-            f"{points / 1e6:.0f} million steps of the proximity ({options.proximity:g} m) lie along the observations, "
-            f"more than the {MOST_POINTS / 1e6:.0f} million that memory is sure to hold; choose a larger proximity, or "
-            "merge the data in parts"
-        )
-    instances, instance = read_instances(table, local_maps, observations.crs)
-    weight = table["weight"].to_numpy(dtype=float) * np.maximum(table["score"].to_numpy(dtype=float), _LEAST_WEIGHT)
-    shapes, is_area = table["shape"].to_numpy(dtype=object), table["is_area"].to_numpy(dtype=bool)
-    rows_of: list[Index] = [np.asarray(rows) for _, rows in sorted(table.groupby(["is_area", "class"]).indices.items())]
-    line_rows = [rows for rows in rows_of if not is_area[rows[0]]]
-    looks = [Looks.of(shapes[rows], instance[rows], weight[rows], instances, options.proximity) for rows in line_rows]
+    given = read_looks(observations, local_maps, options)
+    shapes = observations.table["shape"].to_numpy(dtype=object).copy()
+    looks = [given.looks_of(rows) for _, rows in given.lines]
     lines, corrections = merge_lines(looks, lambda share: advance(0.9 * share))
-    if looks:
-        centre = centres(looks, len(instances))
-        areas = np.flatnonzero(is_area)
-        shapes = shapes.copy()
-        shapes[areas] = moved_by(shapes[areas], instance[areas], corrections, centre)
+    shapes = given.follow(shapes, looks, corrections)
     found: list[Lines | Areas] = []
     pieces: list[_Pieces] = []
-    for rows, each, seen in zip(line_rows, lines, looks, strict=True):
+    for (_, rows), each, seen in zip(given.lines, lines, looks, strict=True):
         pieces.append(_pieces_of_lines(rows, each, seen, sum(len(one.shapes) for one in found), _PIECE))
         found.append(each)
-    for rows in (rows for rows in rows_of if is_area[rows[0]]):
-        area = merge_looks_at_areas(shapes[rows], instance[rows], weight[rows], instances, options.proximity)
+    for _, rows in given.areas:
+        area = given.merge_areas(shapes, rows)
         pieces.append(_pieces_of_areas(rows, area, sum(len(one.shapes) for one in found)))
         found.append(area)
     advance(1.0)
     return _put_together(observations, found, _joined(pieces), corrections)
-
-
-def read_instances(table: pd.DataFrame, local_maps: Sequence[LocalMaps], crs: pyproj.CRS) -> tuple[Instances, Index]:
-    """Bring the local maps of a merge together: those of the observations, then those that saw nothing.
-
-    Parameters
-    ----------
-    table : DataFrame
-        The observations, with `drive`, `instance` and `group`.
-    local_maps : sequence of LocalMaps
-        Their layers, with `instances` where these are known.
-    crs : pyproj.CRS
-        Of the work.
-
-    Returns
-    -------
-    instances : Instances
-        Footprints are known where they are of all local maps.
-    instance : ndarray of int
-        The local map of each observation.
-    """
-    codes, groups = pd.factorize(table["group"])
-    firsts = table.drop_duplicates("group").set_index("group").loc[groups]
-    names = firsts[["drive", "instance"]].astype(str).reset_index(drop=True)
-    frames = [_known(maps.instances, crs) for maps in local_maps if maps.instances is not None]
-    known = pd.concat([names.iloc[:0], *frames], ignore_index=True).drop_duplicates(["drive", "instance"])
-    every = pd.concat([names, known[["drive", "instance"]]], ignore_index=True)
-    # Local maps that have observations come first, also where several go by one name.
-    every = every[~(every.duplicated() & (np.arange(len(every)) >= len(names)))]
-    rows = pd.MultiIndex.from_frame(known[["drive", "instance"]]).get_indexer(pd.MultiIndex.from_frame(every))
-    position, heading, footprint = np.full((len(every), 2), np.nan), np.full(len(every), np.nan), None
-    there = rows >= 0
-    if there.any():
-        position[there] = known[["x", "y"]].to_numpy(dtype=float)[rows[there]]
-        heading[there] = known["heading"].to_numpy(dtype=float)[rows[there]]
-    if there.all() and len(every):
-        footprint = known["footprint"].to_numpy(dtype=object)[rows]
-        shapely.prepare(footprint)
-    return Instances(pd.factorize(every["drive"])[0], footprint, position, heading), codes
-
-
-def _known(frame: gpd.GeoDataFrame, crs: pyproj.CRS) -> pd.DataFrame:
-    """Return drive, instance, position, heading (radians counter-clockwise from x) and footprint, in the work's CRS."""
-    places, areas = frame[["x", "y"]].to_numpy(dtype=float), frame.geometry.to_numpy()
-    if frame.crs is not None and frame.crs != crs:
-        source = pyproj.CRS.from_user_input(frame.crs)
-        places = transform_coordinates(places, source, crs)
-        areas = shapely.transform(areas, lambda xy: transform_coordinates(xy, source, crs))
-    columns = {name: frame[name].astype(str).to_numpy() for name in ("drive", "instance")}
-    heading = np.radians(90.0 - frame["heading"].to_numpy(dtype=float))
-    return pd.DataFrame({**columns, "x": places[:, 0], "y": places[:, 1], "heading": heading, "footprint": areas})
 
 
 def _pieces_of_lines(rows: Index, lines: Lines, looks: Looks, first: int, shortest: float) -> _Pieces:
