@@ -1,5 +1,6 @@
 """Merge many overlapping, imperfect digitisations of the same lines into one clean map."""
 
+from polymerge_core.consensus import State, accumulate
 from polymerge_core.errors import CrsError, InputError, OptionError, OutputError, PolymergeError, SchemaError
 from polymerge_core.evaluation import Evaluation, evaluate
 from polymerge_core.formats import read_poses, read_predictions
@@ -21,6 +22,8 @@ __all__ = [
     "OutputError",
     "PolymergeError",
     "SchemaError",
+    "State",
+    "accumulate",
     "evaluate",
     "merge",
     "merge_network",

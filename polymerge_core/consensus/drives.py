@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polymerge_core.consensus.axes import Axes
 from polymerge_core.consensus.drift import Drift, estimate_drift, no_drift, pulls
-from polymerge_core.consensus.fusion import Noise, fuse
+from polymerge_core.consensus.fusion import SHARED, Noise, fuse
 from polymerge_core.consensus.known import remembering
 from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.membership import line_along
@@ -29,8 +29,8 @@ _DRIFTS = 3
 #: A piece of a drive's line is longer than so many points.
 _SHORT_TRACK = 3
 
-#: Columns of `PAST` that tell of drives what those of local maps tell of these.
-_OF_DRIVES = [0, 3, 4, 3, 4]
+#: Columns of `PAST` that tell of drives what the others tell of local maps.
+_OF_DRIVES = [3, 3, 4, 3, 4]
 
 
 def join_drives(states: list[State], centre: Array) -> tuple[list[State], Array]:
@@ -104,9 +104,10 @@ def _tracks(state: State, drives: Instances) -> _Tracks:
     # What was known before goes along as what one drive saw.
     looks, group = tracks.looks, state.group[state.looks.owner[old]]
     known = looks.point_instance == drives.known
-    remembered = remembering(
-        looks, line[looks.owner], state.looks.points[old], group, state.looks.past[old][:, _OF_DRIVES]
-    )
+    # As much as so many other drives, of which each counts as one look.
+    told = state.looks.past[old][:, _OF_DRIVES]
+    told[:, 0] /= (SHARED * looks.unit) ** 2
+    remembered = remembering(looks, line[looks.owner], state.looks.points[old], group, told)
     past = np.where(known[:, None], remembered.past, looks.past)
     return tracks._replace(looks=looks.remembering(past))
 

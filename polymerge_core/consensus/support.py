@@ -201,5 +201,6 @@ def shapes_of(stations: Array, stretches: Stretches, tolerance: float) -> NDArra
     if len(owner) == 0:
         return np.empty(0, dtype=object)
     drawn = shapely.linestrings(stations[rows], indices=owner)
-    shapes: NDArray[np.object_] = shapely.simplify(drawn, tolerance)
+    # Simplifying by nothing would still take the vertices out of straight lines.
+    shapes: NDArray[np.object_] = shapely.simplify(drawn, tolerance) if tolerance > 0 else drawn
     return shapes

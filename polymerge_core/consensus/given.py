@@ -1,0 +1,159 @@
+"""What a consensus starts from: observations and local maps in the terms of looks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from polymerge_core.consensus.areas import Areas, merge_looks_at_areas
+from polymerge_core.consensus.known import KnownAreas
+from polymerge_core.consensus.looks import Instances, Looks
+from polymerge_core.consensus.registration import centres, moved_by
+from polymerge_core.crs import transform_coordinates
+from polymerge_core.curves import Array, Index
+from polymerge_core.errors import InputError
+from polymerge_core.observations import Observations
+from polymerge_core.options import Options
+from polymerge_core.schema import LocalMaps
+
+#: More steps than this along all observations are a proximity that is too small for them (some 500 bytes each).
+MOST_POINTS = 20_000_000
+
+#: A score of 0 still counts this much, so that something comes of observations that all have it.
+_LEAST_WEIGHT = 1e-3
+
+
+@dataclass(frozen=True)
+class Given:
+    """Observations in the terms of looks.
+
+    Parameters
+    ----------
+    table : DataFrame
+        The observations.
+    instances : Instances
+        The local maps.
+    instance, weight : ndarray, shape (n,)
+        The local map of each observation, and how much it counts.
+    lines, areas : list of (str, ndarray of int)
+        The classes in order, and the observations of each.
+    unit : float
+        The proximity, metres.
+    """
+
+    table: pd.DataFrame
+    instances: Instances
+    instance: Index
+    weight: Array
+    lines: list[tuple[str, Index]]
+    areas: list[tuple[str, Index]]
+    unit: float
+
+    def looks_of(self, rows: Index) -> Looks:
+        """Return the looks of one class of lines."""
+        shapes = self.table["shape"].to_numpy(dtype=object)
+        return Looks.of(shapes[rows], self.instance[rows], self.weight[rows], self.instances, self.unit)
+
+    def follow(self, shapes: NDArray[np.object_], looks: list[Looks], corrections: Array) -> NDArray[np.object_]:
+        """Return the shapes of all observations, areas moved as the lines say that their local maps were off."""
+        rows = np.concatenate([rows for _, rows in self.areas]) if self.areas else np.empty(0, np.intp)
+        if looks and len(rows):
+            centre = centres(looks, len(self.instances))
+            shapes[rows] = moved_by(shapes[rows], self.instance[rows], corrections, centre)
+        return shapes
+
+    def merge_areas(self, shapes: NDArray[np.object_], rows: Index, before: KnownAreas | None = None) -> Areas:
+        """Merge one class of areas, given the shapes of all observations."""
+        chosen = (shapes[rows], self.instance[rows], self.weight[rows])
+        return merge_looks_at_areas(*chosen, self.instances, self.unit, before)
+
+
+def read_looks(observations: Observations, local_maps: Sequence[LocalMaps], options: Options) -> Given:
+    """Put observations in the terms of looks.
+
+    Parameters
+    ----------
+    observations : Observations
+        All of them, main map first.
+    local_maps : sequence of LocalMaps
+        Where they came from, with what is known of the local maps.
+    options : Options
+        The proximity.
+
+    Raises
+    ------
+    InputError
+        If the proximity is too small for so much length.
+    """
+    table = observations.table
+    points = float(table.loc[~table["is_area"], "length_m"].sum()) / options.proximity
+    if points > MOST_POINTS:
+        raise InputError(
+            f"{points / 1e6:.0f} million steps of the proximity ({options.proximity:g} m) lie along the observations, "
+            f"more than the {MOST_POINTS / 1e6:.0f} million that memory is sure to hold; choose a larger proximity, or "
+            "merge the data in parts"
+        )
+    instances, instance = read_instances(table, local_maps, observations.crs)
+    weight = table["weight"].to_numpy(dtype=float) * np.maximum(table["score"].to_numpy(dtype=float), _LEAST_WEIGHT)
+    classes = [(key, np.asarray(rows)) for key, rows in sorted(table.groupby(["is_area", "class"]).indices.items())]
+    lines = [(str(name), rows) for (is_area, name), rows in classes if not is_area]
+    areas = [(str(name), rows) for (is_area, name), rows in classes if is_area]
+    return Given(table, instances, instance, weight, lines, areas, options.proximity)
+
+
+def read_instances(table: pd.DataFrame, local_maps: Sequence[LocalMaps], crs: pyproj.CRS) -> tuple[Instances, Index]:
+    """Bring the local maps of a merge together: those of the observations, then those that saw nothing.
+
+    Parameters
+    ----------
+    table : DataFrame
+        The observations, with `drive`, `instance` and `group`.
+    local_maps : sequence of LocalMaps
+        Their layers, with `instances` where these are known.
+    crs : pyproj.CRS
+        Of the work.
+
+    Returns
+    -------
+    instances : Instances
+        Footprints are known where they are of all local maps.
+    instance : ndarray of int
+        The local map of each observation.
+    """
+    codes, groups = pd.factorize(table["group"])
+    firsts = table.drop_duplicates("group").set_index("group").loc[groups]
+    names = firsts[["drive", "instance"]].astype(str).reset_index(drop=True)
+    frames = [_known(maps.instances, crs) for maps in local_maps if maps.instances is not None]
+    known = pd.concat([names.iloc[:0], *frames], ignore_index=True).drop_duplicates(["drive", "instance"])
+    every = pd.concat([names, known[["drive", "instance"]]], ignore_index=True)
+    # Local maps that have observations come first, also where several go by one name.
+    every = every[~(every.duplicated() & (np.arange(len(every)) >= len(names)))]
+    rows = pd.MultiIndex.from_frame(known[["drive", "instance"]]).get_indexer(pd.MultiIndex.from_frame(every))
+    position, heading, footprint = np.full((len(every), 2), np.nan), np.full(len(every), np.nan), None
+    there = rows >= 0
+    if there.any():
+        position[there] = known[["x", "y"]].to_numpy(dtype=float)[rows[there]]
+        heading[there] = known["heading"].to_numpy(dtype=float)[rows[there]]
+    if there.all() and len(every):
+        footprint = known["footprint"].to_numpy(dtype=object)[rows]
+        shapely.prepare(footprint)
+    return Instances(pd.factorize(every["drive"])[0], footprint, position, heading), codes
+
+
+def _known(frame: gpd.GeoDataFrame, crs: pyproj.CRS) -> pd.DataFrame:
+    """Return drive, instance, position, heading (radians counter-clockwise from x) and footprint, in the work's CRS."""
+    places, areas = frame[["x", "y"]].to_numpy(dtype=float), frame.geometry.to_numpy()
+    if frame.crs is not None and frame.crs != crs:
+        source = pyproj.CRS.from_user_input(frame.crs)
+        places = transform_coordinates(places, source, crs)
+        areas = shapely.transform(areas, lambda xy: transform_coordinates(xy, source, crs))
+    columns = {name: frame[name].astype(str).to_numpy() for name in ("drive", "instance")}
+    heading = np.radians(90.0 - frame["heading"].to_numpy(dtype=float))
+    return pd.DataFrame({**columns, "x": places[:, 0], "y": places[:, 1], "heading": heading, "footprint": areas})
