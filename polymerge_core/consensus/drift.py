@@ -80,7 +80,7 @@ def pulls(tracks: Looks, fit: Fit, drift: Drift) -> Pulls:
     rows = np.flatnonzero(fit.used)
     owner = tracks.owner[rows]
     count = np.maximum(np.round(tracks.curves.length / (_STRETCH * tracks.unit)), 1)
-    share = tracks.arc[rows] / tracks.curves.length[owner]
+    share = tracks.arc[rows] / np.maximum(tracks.curves.length[owner], np.finfo(float).tiny)
     number = np.minimum(share * count[owner], count[owner] - 1).astype(np.intp)
     _, stretch = np.unique(owner * (int(count.max(initial=1)) + 1) + number, return_inverse=True)
     size = np.bincount(stretch)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polymerge_core.consensus.axes import Axes
 from polymerge_core.consensus.drift import Drift, estimate_drift, no_drift, pulls
-from polymerge_core.consensus.fusion import SHARED, Noise, fuse
+from polymerge_core.consensus.fusion import FIRST_NOISE, SHARED, Noise, fuse
 from polymerge_core.consensus.known import remembering
 from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.membership import line_along
@@ -33,7 +33,7 @@ _SHORT_TRACK = 3
 _OF_DRIVES = [3, 3, 4, 3, 4]
 
 
-def join_drives(states: list[State], centre: Array) -> tuple[list[State], Array]:
+def join_drives(states: list[State], centre: Array) -> tuple[list[State], Array, Drift]:
     """Put the lines of the drives together, each drive shifted to where the drives together are.
 
     Parameters
@@ -49,6 +49,8 @@ def join_drives(states: list[State], centre: Array) -> tuple[list[State], Array]
         The lines of all drives.
     shift : ndarray of float, shape (k, 2)
         How each local map was shifted, metres east and north.
+    drift : Drift
+        The shift of each drive at any place.
     """
     instances, unit = states[0].looks.instances, states[0].looks.unit
     drives = instances.by_drive()
@@ -66,7 +68,7 @@ def join_drives(states: list[State], centre: Array) -> tuple[list[State], Array]
         _of_all_drives(state, each, one) if one else moved(state, np.zeros((len(centre), 3)), centre)
         for state, each, one in zip(followed, tracks, joined, strict=True)
     ]
-    return found, shift
+    return found, shift, drift
 
 
 def _follow(state: State, shift: Array, drift: Drift) -> State:
@@ -106,7 +108,7 @@ def _tracks(state: State, drives: Instances) -> _Tracks:
     known = looks.point_instance == drives.known
     # As much as so many other drives, of which each counts as one look.
     told = state.looks.past[old][:, _OF_DRIVES]
-    told[:, 0] /= (SHARED * looks.unit) ** 2
+    told[:, 0] /= (FIRST_NOISE**2 + SHARED**2) * looks.unit**2
     remembered = remembering(looks, line[looks.owner], state.looks.points[old], group, told)
     past = np.where(known[:, None], remembered.past, looks.past)
     return tracks._replace(looks=looks.remembering(past))

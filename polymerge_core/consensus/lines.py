@@ -15,9 +15,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from polymerge_core.consensus.drift import Drift, no_drift
 from polymerge_core.consensus.drives import join_drives
 from polymerge_core.consensus.known import KnownLines, known_lines
-from polymerge_core.consensus.looks import Instances, Looks
+from polymerge_core.consensus.looks import Looks
 from polymerge_core.consensus.registration import centres, corrections, equations
 from polymerge_core.consensus.support import Stretches, Support, shapes_of, stretch_of, support, supported_stretches
 from polymerge_core.consensus.tracing import State, moved, trace
@@ -56,7 +57,7 @@ class Lines(NamedTuple):
     known: KnownLines
 
 
-def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tuple[list[Lines], Array]:
+def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tuple[list[Lines], Array, Drift]:
     """Merge the looks at lines of all classes.
 
     Parameters
@@ -72,9 +73,11 @@ def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tup
         One entry a class.
     correction : ndarray of float, shape (k, 3)
         How each local map was moved: metres east and north, radians counter-clockwise.
+    drift : Drift
+        The part of it that is the drives'.
     """
     if not classes:
-        return [], np.zeros((0, 3))
+        return [], np.zeros((0, 3)), no_drift()
     instances, unit = classes[0].instances, classes[0].unit
     states = []
     for number, looks in enumerate(classes):
@@ -82,25 +85,21 @@ def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tup
         advance(0.6 * (number + 1) / len(classes))
     centre = centres(classes, len(instances))
     shifted, corrected = np.zeros((len(centre), 3)), np.zeros((len(centre), 3))
+    drift = no_drift()
     if len(np.unique(instances.drive)) > 1:
-        states, shifted[:, :2] = join_drives(states, centre)
+        states, shifted[:, :2], drift = join_drives(states, centre)
     for number in range(_CORRECTIONS):
         total = equations(states[0].looks, states[0].fit, centre)
         for state in states[1:]:
             total = total.add(equations(state.looks, state.fit, centre))
         step = corrections(total, corrected, unit)
-        step = _of_their_own(step, instances)
+        if instances.known >= 0:
+            # It has been shifted by its share, as the drives were.
+            step[instances.known] = 0.0
         states = [moved(state, step, centre) for state in states]
         corrected += step
         advance(0.6 + 0.35 * (number + 1) / _CORRECTIONS)
-    return [_finish(state) for state in states], shifted + corrected
-
-
-def _of_their_own(step: Array, instances: Instances) -> Array:
-    """Return corrections without what those of a drive have in common, which is the drive's, and with none of the map."""
-    count = np.maximum(np.bincount(instances.drive), 1)
-    common = np.column_stack([np.bincount(instances.drive, column) for column in step.T]) / count[:, None]
-    return step - common[instances.drive]
+    return [_finish(state) for state in states], shifted + corrected, drift
 
 
 def _finish(state: State) -> Lines:

@@ -91,7 +91,7 @@ def merge_by_consensus(
     given = read_looks(observations, local_maps, options)
     shapes = observations.table["shape"].to_numpy(dtype=object).copy()
     looks = [given.looks_of(rows) for _, rows in given.lines]
-    lines, corrections = merge_lines(looks, lambda share: advance(0.9 * share))
+    lines, corrections, _ = merge_lines(looks, lambda share: advance(0.9 * share))
     shapes = given.follow(shapes, looks, corrections)
     found: list[Lines | Areas] = []
     pieces: list[_Pieces] = []

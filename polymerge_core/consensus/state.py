@@ -19,6 +19,7 @@ import shapely
 
 from polymerge_core.consensus.areas import Areas
 from polymerge_core.consensus.axes import Axes
+from polymerge_core.consensus.drift import Drift
 from polymerge_core.consensus.given import Given, read_looks
 from polymerge_core.consensus.known import KnownAreas, KnownLines
 from polymerge_core.consensus.lines import merge_lines
@@ -129,9 +130,9 @@ def _added(given: Given, state: State | None, crs: pyproj.CRS) -> State:
         given = replace(given, instances=given.instances.with_known(state.looked))
         looked = None if looked is None or state.looked is None else shapely.union(looked, state.looked)
     names, looks = _looks(given, state)
-    lines, corrections = merge_lines(looks, lambda _: None)
+    lines, corrections, drift = merge_lines(looks, lambda _: None)
     shapes = given.follow(given.table["shape"].to_numpy(dtype=object).copy(), looks, corrections)
-    before = {} if state is None else state.areas
+    before = {} if state is None else {name: _shifted(areas, drift, given) for name, areas in state.areas.items()}
     new = dict(given.areas)
     nothing = np.empty(0, np.intp)
     areas: dict[str, Areas] = {
@@ -144,6 +145,15 @@ def _added(given: Given, state: State | None, crs: pyproj.CRS) -> State:
         {name: each.known for name, each in areas.items()},
         looked,
     )
+
+
+def _shifted(areas: KnownAreas, drift: Drift, given: Given) -> KnownAreas:
+    """Return known areas shifted as the lines about them."""
+    middles = shapely.get_coordinates(shapely.centroid(areas.polygons))
+    drive = np.full(len(middles), given.instances.drive[given.instances.known])
+    shift = drift.at(drive, middles)
+    points, owner = shapely.get_coordinates(areas.polygons, return_index=True)
+    return areas._replace(polygons=shapely.set_coordinates(areas.polygons.copy(), points + shift[owner]))
 
 
 def _looks(given: Given, state: State | None) -> tuple[list[str], list[Looks]]:

@@ -11,8 +11,10 @@ import shapely
 
 import polymerge_core as pm
 from benchmarks import simulate_drive
+from benchmarks.scenarios import av2_scenarios
 from polymerge_core.__main__ import main
 from polymerge_core.io import read_table
+from tests.core.test_consensus_state import distances, some
 
 AV2 = {
     "PIT": ("7fab2350-7eaf-3b7e-a39d-6937a4c1bede", "583710.0070,4477259.9998"),
@@ -120,3 +122,15 @@ def test_three_sources_of_one_street_network(real_data, tmp_path):
     assert 0 < len(elements) < 738
     assert {"highway", "name"} <= set(elements.columns)
     assert_nothing_lost([roads], merged)
+
+
+def test_what_is_known_and_what_is_added_give_what_both_give_at_once(real_data):
+    apart = []
+    for scenario in [each for seed in (1, 2, 3) for each in av2_scenarios(real_data, seed=seed)]:
+        (local,) = scenario.local
+        half = len(local.instances) // 2
+        parts = some(local, np.arange(half)), some(local, np.arange(half, len(local.instances)))
+        together = pm.accumulate(list(parts)).elements()
+        apart.append(distances(together, pm.accumulate(parts[1], pm.accumulate(parts[0])).elements()))
+    assert np.median(np.concatenate(apart)) <= 0.05
+    assert np.quantile(np.concatenate(apart), 0.95) <= 0.20
