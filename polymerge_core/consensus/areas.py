@@ -120,8 +120,20 @@ def merge_looks_at_areas(
     support = Support._make(new + old for new, old in zip(support, past.T, strict=True))
     kept = support.enough
     number = np.where(kept, np.cumsum(kept) - 1, -1)
-    known = KnownAreas(shapes, np.bincount(group, weight), np.bincount(group, whole) > 0, np.column_stack([*support]))
-    return Areas(shapes[kept], sigma[kept], support.seen[kept], support.expected[kept], number[group[:count]], known)
+    known = KnownAreas(
+        shapes,
+        np.bincount(group, weight),
+        np.bincount(group, whole) > 0,
+        np.column_stack([*support]).astype(np.float64),
+    )
+    return Areas(
+        shapes[kept],
+        sigma[kept],
+        support.seen[kept].astype(np.float64),
+        support.expected[kept],
+        number[group[:count]],
+        known,
+    )
 
 
 def group_areas(polygons: NDArray[np.object_], instance: Index, whole: NDArray[np.bool_], unit: float) -> Index:

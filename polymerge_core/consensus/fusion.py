@@ -143,9 +143,9 @@ def _offsets(
     # What was known is the outcome of many looks, and of so many drives: no single one that could stray.
     information = np.where(before, known * looks.metres[rows] / looks.unit, information)
     sigma, share = np.where(before, 1.0, sigma), np.where(before, np.maximum(information, _TINY), share)
-    of_before = np.bincount(place, before)
-    drives_before = np.bincount(place, np.where(before, looks.past[rows, DRIVES], 0.0)) / np.maximum(of_before, 1.0)
-    of_before = of_before > 0
+    points_before = np.bincount(place, before)
+    drives_before = np.bincount(place, np.where(before, looks.past[rows, DRIVES], 0.0)) / np.maximum(points_before, 1)
+    of_before = points_before > 0
     drive_sigma = noise.drive_sigma / np.sqrt(np.maximum(drives_before, 1.0))
     middle, scale = np.zeros(count), HALF_WEIGHT * sigma
     offset, weight, error, knowledge = middle, middle, middle, middle

@@ -102,10 +102,15 @@ def read_looks(observations: Observations, local_maps: Sequence[LocalMaps], opti
         )
     instances, instance = read_instances(table, local_maps, observations.crs)
     weight = table["weight"].to_numpy(dtype=float) * np.maximum(table["score"].to_numpy(dtype=float), _LEAST_WEIGHT)
-    classes = [(key, np.asarray(rows)) for key, rows in sorted(table.groupby(["is_area", "class"]).indices.items())]
-    lines = [(str(name), rows) for (is_area, name), rows in classes if not is_area]
-    areas = [(str(name), rows) for (is_area, name), rows in classes if is_area]
+    is_area = table["is_area"].to_numpy(dtype=bool)
+    lines, areas = (_by_class(table, np.flatnonzero(kind)) for kind in (~is_area, is_area))
     return Given(table, instances, instance, weight, lines, areas, options.proximity)
+
+
+def _by_class(table: pd.DataFrame, rows: Index) -> list[tuple[str, Index]]:
+    """Return the classes of some observations in order, and which are of each."""
+    groups = table.iloc[rows].groupby("class").indices
+    return [(str(name), rows[np.asarray(members)]) for name, members in sorted(groups.items())]
 
 
 def read_instances(table: pd.DataFrame, local_maps: Sequence[LocalMaps], crs: pyproj.CRS) -> tuple[Instances, Index]:

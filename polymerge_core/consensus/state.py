@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import geopandas as gpd
 import numpy as np
@@ -28,10 +28,7 @@ from polymerge_core.consensus.support import Support, shapes_of, supported_stret
 from polymerge_core.errors import CrsError, OptionError
 from polymerge_core.observations import as_lines, observe
 from polymerge_core.options import Options
-from polymerge_core.sets import as_local_maps
-
-if TYPE_CHECKING:
-    from polymerge_core.merge import Input
+from polymerge_core.sets import Input, as_local_maps
 
 #: Of the structure; a later one can read what an earlier one wrote, or says that it cannot.
 VERSION = 1
