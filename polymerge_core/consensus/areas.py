@@ -122,7 +122,7 @@ def merge_looks_at_areas(
     number = np.where(kept, np.cumsum(kept) - 1, -1)
     known = KnownAreas(
         shapes,
-        np.bincount(group, weight),
+        np.bincount(group, weight).astype(np.float64),
         np.bincount(group, whole) > 0,
         np.column_stack([*support]).astype(np.float64),
     )

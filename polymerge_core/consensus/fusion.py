@@ -20,7 +20,7 @@ from polymerge_core.consensus.looks import DRIVES, Looks
 from polymerge_core.curves import Array, Index
 
 #: The errors along a look are alike over this many proximities, so that it counts as one measurement over each of them.
-CORRELATION = 10.0
+CORRELATION = 20.0
 
 #: A residual of so many standard deviations counts half: for normal errors a mean weighted so is 95 % efficient.
 HALF_WEIGHT = 2.385

@@ -186,8 +186,9 @@ def _put_together(
     shapes = np.where(shapely.length(shapes) > MIN_SEGMENT_M, shapes, kept["shape"].to_numpy(dtype=object)[sets.base])
     total = np.bincount(component, kept["weight"], len(used))
     mean = np.bincount(component, kept["weight"] * kept["score"], len(used)) / np.maximum(total, 1)
-    # The rule of succession: how surely one that looks there sees it.
-    confidence = mean * (seen + 1) / (np.maximum(expected, seen) + 2)
+    # The rule of succession: how surely one that looks there sees it, where it is known who looked there.
+    surely = np.where(expected > 0, (seen + 1) / (np.maximum(expected, seen) + 2), 1.0)
+    confidence = mean * surely
     return Consensus(chosen, sets, shapes, {"score": confidence.astype(float), "sigma_m": sigma}, corrections)
 
 
