@@ -150,6 +150,12 @@ def count_up(counts: Index) -> tuple[Index, Index]:
     return owner, np.arange(len(owner)) - first[owner]
 
 
+def distinct(values: Index) -> Index:
+    """Return the distinct values, rising: `numpy.unique` by sorting, which is several times faster for so many."""
+    ordered = np.sort(values)
+    return ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
+
+
 def turning(curves: Curves) -> Array:
     """Return how much each line turns at each vertex, radians, shape of `vertices`; ends of open lines do not turn."""
     steps = np.diff(curves.vertices, axis=0, append=curves.vertices[-1:])

@@ -19,7 +19,7 @@ from polymerge_core.consensus.fusion import HALF_WEIGHT
 from polymerge_core.consensus.known import KnownAreas, nothing_known
 from polymerge_core.consensus.looks import Instances
 from polymerge_core.consensus.support import Support, judge
-from polymerge_core.curves import Array, Index
+from polymerge_core.curves import Array, Index, distinct
 
 #: Looks belong together where they have this share of the smaller one in common, in the mean.
 OVERLAP = 0.5
@@ -112,7 +112,7 @@ def merge_looks_at_areas(
     fused = [fuse_areas(polygons[row], weight[row], edges[row], whole[row], unit) for row in members]
     shapes = np.array([shape for shape, _ in fused], dtype=object)
     sigma = np.array([error for _, error in fused])
-    pairs = np.unique(group * len(instances) + instance)
+    pairs = distinct(group * len(instances) + instance)
     places = shapely.get_coordinates(shapely.centroid(shapes))
     support = judge(places, pairs, instances, _SQUARE * unit)
     past = np.zeros((len(shapes), len(Support._fields)))

@@ -119,8 +119,8 @@ class Axes:
         ahead = dot(tangent, offset)
         neighbour = np.where((ahead >= 0)[:, None], self.stations[after], self.stations[before])
         chord = neighbour - self.stations[station]
-        square = (chord**2).sum(axis=1)
-        share = np.clip((chord * offset).sum(axis=1) / np.maximum(square, np.finfo(float).tiny), 0.0, 1.0)
+        square = dot(chord, chord)
+        share = np.clip(dot(chord, offset) / np.maximum(square, np.finfo(float).tiny), 0.0, 1.0)
         rest = offset - share[:, None] * chord
         beside = (square > 0) | (np.abs(ahead) <= 0.5 * unit)
         lateral = cross(tangent, rest)

@@ -188,4 +188,4 @@ def cross(first: Array, second: Array) -> Array:
 
 def dot(first: Array, second: Array) -> Array:
     """Return how far `second` reaches along unit vectors `first`."""
-    return np.asarray((first * second).sum(axis=1))
+    return np.asarray(first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1])

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from polymerge_core.consensus.alongside import ANGLE_DEG, REACH
 from polymerge_core.consensus.axes import Axes
 from polymerge_core.consensus.looks import Looks, cross, dot
-from polymerge_core.curves import Array, Index
+from polymerge_core.curves import Array, Index, distinct
 
 #: Stations of lines that are looked at for each point.
 _NEAREST = 8
@@ -59,7 +59,7 @@ def sightings(looks: Looks, group: Index, beside: Beside) -> tuple[Index, Index]
     """Return the stations of the lines and the local maps whose looks at that line run beside them, each pair once."""
     own = beside.line == group[looks.owner[beside.point]]
     instances = len(looks.instances)
-    pairs = np.unique(beside.station[own] * instances + looks.point_instance[beside.point[own]])
+    pairs = distinct(beside.station[own] * instances + looks.point_instance[beside.point[own]])
     return pairs // instances, pairs % instances
 
 
@@ -131,10 +131,16 @@ def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
 
 def _taken(looks: Looks, beside: Beside, own: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Tell where a look runs beside a line that another look of its local map, which is of that line, shows there."""
-    owner = looks.owner[beside.point]
-    place = beside.station * len(looks.instances) + looks.instance[owner]
+    foreign = np.flatnonzero(~own)
+    found = np.zeros(len(own), dtype=bool)
+    if len(foreign) in (0, len(own)):
+        return found
     step = len(looks.instances)
+    place = beside.station * step + looks.instance[looks.owner[beside.point]]
+    there = distinct(place[own])
     # Points are as far apart as stations, so that a neighbour may be the one that the other look has.
-    near = np.concatenate([place[own] + shift * step for shift in (-1, 0, 1)])
-    there = np.unique(near)
-    return ~own & np.isin(place, there)
+    for shift in (-step, 0, step):
+        wanted = place[foreign] + shift
+        at = np.minimum(np.searchsorted(there, wanted), len(there) - 1)
+        found[foreign] |= there[at] == wanted
+    return found

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from polymerge_core.consensus.axes import LINE_APART, Axes
 from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.membership import points_beside, sightings
-from polymerge_core.curves import Array, Index
+from polymerge_core.curves import Array, Index, distinct
 
 #: What is seen as often as expected is seen so by chance now and then: fewer than this times the square root of what is
 #: expected is too few ...
@@ -108,7 +108,7 @@ def judge(places: Array, pairs: Index, instances: Instances, square: float, driv
     count, drives = len(instances), int(instances.drive.max(initial=-1)) + 1
     pairs = pairs[pairs % count != instances.known] if instances.known >= 0 else pairs
     seen = np.bincount(pairs // count, minlength=len(places)) if len(pairs) else np.zeros(len(places), np.intp)
-    seen_by = np.unique(pairs // count * drives + instances.drive[pairs % count])
+    seen_by = distinct(pairs // count * drives + instances.drive[pairs % count])
     seen_drives = np.bincount(seen_by // drives, minlength=len(places)) if len(pairs) else seen
     if instances.footprint is None or len(places) == 0:
         return Support(seen, np.zeros(len(places)), seen_drives, np.zeros(len(places)))
@@ -160,7 +160,7 @@ def _sightings(looks: Looks, group: Index, axes: Axes) -> Index:
     inside = (station > 0) & (station < stations - 1)
     station, skipped = station[inside], skipped[inside]
     skipped = skipped[axes.line[station - 1] == axes.line[station + 1]]
-    found = np.union1d(found, skipped)
+    found = distinct(np.concatenate([found, skipped]))
     return np.sort((found % stations) * instances + found // stations)
 
 
