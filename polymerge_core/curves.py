@@ -16,6 +16,10 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 
+#: Places along lines nearer to each other than this are the same, metres.
+_SAME = 1e-9
+
+
 class Pieces(NamedTuple):
     """Lines cut into pieces of even length, one entry a piece, line by line."""
 
@@ -130,8 +134,9 @@ class Curves:
     def stretches(self, line: Index, start: Array, stop: Array) -> NDArray[np.object_]:
         """Return stretches (start < stop, within the line) as lines with all their vertices."""
         laid_start, laid_stop = self._start[line] + start, self._start[line] + stop
-        first = np.maximum(np.searchsorted(self._laid, laid_start, side="right"), self.bounds[line])
-        last = np.minimum(np.searchsorted(self._laid, laid_stop, side="left"), self.bounds[line + 1])
+        # A vertex where the stretch begins or ends, but for rounding, is its end, and must not come twice.
+        first = np.maximum(np.searchsorted(self._laid, laid_start + _SAME, side="right"), self.bounds[line])
+        last = np.minimum(np.searchsorted(self._laid, laid_stop - _SAME, side="left"), self.bounds[line + 1])
         owner, number = count_up(np.maximum(last - first, 0))
         inner = self.vertices[first[owner] + number]
         every = np.arange(len(line))
