@@ -28,15 +28,15 @@ _LOCAL_MAP_COLUMNS = {"drive", "instance"}
 _INSTANCE_COLUMNS = ("drive", "instance", "timestamp_ns", "x", "y", "heading", "n_observations")
 
 
-def read_local_maps(sources: Iterable[str | os.PathLike[str]]) -> list[LocalMaps]:
+def read_local_maps(sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[LocalMaps]:
     """Read local maps by the layer contract.
 
     Parameters
     ----------
-    sources : iterable of path
-        Files, or ``FILE|layername=LAYER``. A file without a layer means its layer ``local_maps`` (with the
-        layer ``instances`` and the table ``left_out`` beside it) where there is one, else its layer
-        ``elements`` (and ``elements_areas`` and the table ``id_aliases``), else all its line and polygon layers.
+    sources : path, or iterable of path
+        One file, or several; each as a path, or as ``FILE|layername=LAYER``. A file without a layer means its
+        layer ``local_maps`` (with the layer ``instances`` and the table ``left_out`` beside it) where there is one,
+        else its layer ``elements`` (and ``elements_areas`` and the table ``id_aliases``), else all its line and polygon layers.
         For a file of one layer, the files that `write_layers` put beside it are read as these:
         ``<stem>_instances.<ext>`` with the table ``left_out`` of ``<stem>_tables.gpkg``, or ``<stem>_areas.<ext>``
         and the table ``id_aliases`` where the file holds elements.
@@ -55,7 +55,8 @@ def read_local_maps(sources: Iterable[str | os.PathLike[str]]) -> list[LocalMaps
     CrsError
         As for `read_layers`.
     """
-    given = [split_source(source) for source in sources]
+    several = [sources] if isinstance(sources, (str, os.PathLike)) else sources
+    given = [split_source(source) for source in several]
     named = {file.resolve() for file, _ in given}
     found: list[tuple[Path, str, LocalMaps]] = []
     for file, layer in given:

@@ -33,6 +33,12 @@ def gpkg(tmp_path):
     return path
 
 
+def test_one_file_needs_no_list(gpkg):
+    (by_text,), (by_path,), (by_list,) = (read_local_maps(given) for given in (str(gpkg), gpkg, [gpkg]))
+    assert by_text.source == by_path.source == by_list.source
+    assert len(by_text.observations) == len(by_list.observations) == 2
+
+
 # -- reading what others wrote
 
 
