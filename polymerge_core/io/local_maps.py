@@ -36,7 +36,8 @@ def read_local_maps(sources: str | os.PathLike[str] | Iterable[str | os.PathLike
     sources : path, or iterable of path
         One file, or several; each as a path, or as ``FILE|layername=LAYER``. A file without a layer means its
         layer ``local_maps`` (with the layer ``instances`` and the table ``left_out`` beside it) where there is one,
-        else its layer ``elements`` (and ``elements_areas`` and the table ``id_aliases``), else all its line and polygon layers.
+        else its layer ``elements`` (and ``elements_areas`` and the table ``id_aliases``), else all its line and
+        polygon layers.
         For a file of one layer, the files that `write_layers` put beside it are read as these:
         ``<stem>_instances.<ext>`` with the table ``left_out`` of ``<stem>_tables.gpkg``, or ``<stem>_areas.<ext>``
         and the table ``id_aliases`` where the file holds elements.
