@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import geopandas as gpd
 import numpy as np
@@ -88,8 +89,13 @@ def measure(count: int, *, lines: int) -> dict[str, float]:
         seconds = dict(zip(STAGES, np.diff(clock).tolist(), strict=True))
         # merge() finds the network again; what is left is the merging of shapes and the tables.
         seconds["merge"] -= seconds["network"]
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"polylines": count, "elements": len(result.elements), "yardstick": yardstick, **seconds, "peak_mb": peak}
+    sizes = {"polylines": count, "elements": len(result.elements)}
+    return sizes | {"yardstick": yardstick, **seconds, "peak_mb": peak_mb()}
+
+
+def peak_mb() -> float:
+    """Return the most memory that this process has taken, megabytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def measure_evaluation(count: int) -> dict[str, float]:
@@ -110,8 +116,7 @@ def measure_evaluation(count: int) -> dict[str, float]:
         pm.evaluate(merged, reference)
         clock.append(time.perf_counter())
         geopandas, read, evaluate = np.diff(clock).tolist()
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"polylines": count, "geopandas": geopandas, "read": read, "evaluate": evaluate, "peak_mb": peak}
+    return {"polylines": count, "geopandas": geopandas, "read": read, "evaluate": evaluate, "peak_mb": peak_mb()}
 
 
 def evaluation_table(rows: list[dict[str, float]]) -> str:
@@ -133,7 +138,7 @@ def measure_apart(case: str, count: int) -> dict[str, float]:
     return json.loads(done.stdout)
 
 
-def growth(rows: list[dict[str, float]], stage: str) -> float:
+def growth(rows: list[dict[str, Any]], stage: str) -> float:
     """Return the exponent of growth between the smallest and the largest size, by least squares in the logarithms."""
     sizes = [math.log(row["polylines"]) for row in rows]
     return float(np.polyfit(sizes, [math.log(max(row[stage], 1e-6)) for row in rows], 1)[0])
@@ -141,17 +146,28 @@ def growth(rows: list[dict[str, float]], stage: str) -> float:
 
 def table(rows: list[dict[str, float]]) -> str:
     """Lay the figures out: seconds, and their ratio to the yardstick."""
-    stages = "".join(f"{stage:>17}" for stage in STAGES)
-    lines = [f"{'polylines':>10} {'elements':>9} {'geopandas':>10} {stages}   peak"]
-    for row in rows:
-        cells = "".join(f"{row[stage]:8.2f} s {row[stage] / row['yardstick']:5.1f} x" for stage in STAGES)
-        lines.append(
-            f"{row['polylines']:>10} {row['elements']:>9} {row['yardstick']:8.2f} s{cells} {row['peak_mb']:6.0f} MB"
-        )
+    lines = [f"{head(STAGES)}   peak"]
+    lines += [f"{cells(row, STAGES)} {row['peak_mb']:6.0f} MB" for row in rows]
     if len(rows) > 1:
-        exponents = "".join(f"{growth(rows, stage):17.2f}" for stage in STAGES)
-        lines.append(f"{'growth':>10} {'':>9} {growth(rows, 'yardstick'):10.2f}{exponents}")
+        lines.append(exponents(rows, STAGES))
     return "\n".join(lines)
+
+
+def head(stages: tuple[str, ...]) -> str:
+    """Return the names of the columns of `cells`."""
+    return f"{'polylines':>10} {'elements':>9} {'geopandas':>10} " + "".join(f"{stage:>17}" for stage in stages)
+
+
+def cells(row: dict[str, Any], stages: tuple[str, ...]) -> str:
+    """Return one size's row: how many lines, seconds, and their ratio to the yardstick."""
+    each = "".join(f"{row[stage]:8.2f} s {row[stage] / row['yardstick']:5.1f} x" for stage in stages)
+    return f"{row['polylines']:>10} {row['elements']:>9} {row['yardstick']:8.2f} s{each}"
+
+
+def exponents(rows: list[dict[str, Any]], stages: tuple[str, ...]) -> str:
+    """Return the row of the growth exponents."""
+    each = "".join(f"{growth(rows, stage):17.2f}" for stage in stages)
+    return f"{'growth':>10} {'':>9} {growth(rows, 'yardstick'):10.2f}{each}"
 
 
 def main() -> None:

@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import polymerge_core as pm
 from benchmarks.scenarios import deecamp
-from benchmarks.speed import CRS, LOOKS, VERTICES, growth, looks_at_lines
+from benchmarks.speed import CRS, LOOKS, VERTICES, cells, exponents, growth, head, looks_at_lines, peak_mb
 from polymerge_core.schema import INSTANCES_LAYER, LOCAL_MAPS_LAYER
 
 STAGES = ("read", "merge", "write")
@@ -141,7 +141,7 @@ def measure(layers: Layers) -> Figures:
     seconds = dict(zip(STAGES, np.diff(clock).tolist(), strict=True))
     ratio = sum(seconds.values()) / yardstick
     sizes = {"polylines": count, "elements": len(result.elements)}
-    more = {"yardstick": yardstick, "ratio": ratio, "merge_cpu": busy, "load": load, "peak_mb": _peak()}
+    more = {"yardstick": yardstick, "ratio": ratio, "merge_cpu": busy, "load": load, "peak_mb": peak_mb()}
     return sizes | seconds | more
 
 
@@ -157,7 +157,7 @@ def measure_drives(folder: Path) -> Figures:
         clock.append(time.perf_counter())
     seconds = dict(zip(STAGES, np.diff(clock).tolist(), strict=True))
     sizes = {"drives": len(scenario.local), "polylines": len(scenario.observations), "elements": len(result.elements)}
-    return sizes | seconds | {"peak_mb": _peak()}
+    return sizes | seconds | {"peak_mb": peak_mb()}
 
 
 def _merge(local: list[pm.LocalMaps]) -> pm.MergeResult:
@@ -173,10 +173,6 @@ def _write_and_read(layers: Layers, file: Path) -> float:
     return time.perf_counter() - start
 
 
-def _peak() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
 def measure_apart(case: str, what: str, memory: float) -> Figures:
     """Run one measurement in a process of its own; one that failed has `error`, the last line that it wrote."""
     command = [sys.executable, __file__, "--memory", str(memory), "--one", case, what]
@@ -190,21 +186,16 @@ def measure_apart(case: str, what: str, memory: float) -> Figures:
 
 def table(case: Case, rows: list[Figures]) -> str:
     """Lay the figures of one case out: seconds, ratios to the yardstick, and growth against its limit."""
-    stages = "".join(f"{stage:>17}" for stage in STAGES)
-    lines = [f"{'polylines':>10} {'elements':>9} {'geopandas':>10} {stages}     all  merge's CPU   peak"]
+    lines = [f"{head(STAGES)}     all  merge's CPU   peak"]
     done = [row for row in rows if "error" not in row]
     for row in rows:
         if "error" in row:
             lines.append(f"{row['polylines']:>10} {row['error']}")
             continue
-        cells = "".join(f"{row[stage]:8.2f} s {row[stage] / row['yardstick']:5.1f} x" for stage in STAGES)
-        lines.append(
-            f"{row['polylines']:>10} {row['elements']:>9} {row['yardstick']:8.2f} s{cells} {row['ratio']:5.1f} x "
-            f"{row['merge_cpu']:10.2f} s {row['peak_mb']:6.0f} MB"
-        )
+        rest = f"{row['ratio']:5.1f} x {row['merge_cpu']:10.2f} s {row['peak_mb']:6.0f} MB"
+        lines.append(f"{cells(row, STAGES)} {rest}")
     if len(done) > 1:
-        exponents = "".join(f"{growth(done, stage):17.2f}" for stage in STAGES)
-        lines.append(f"{'growth':>10} {'':>9} {growth(done, 'yardstick'):10.2f}{exponents}")
+        lines.append(exponents(done, STAGES))
         both = f"{growth(done, 'merge'):.2f}, its processor time with {growth(done, 'merge_cpu'):.2f}"
         lines.append(f"The merge grows with the power {both} (limit {case.limit}).")
     if done and case.limit == GROUPS_GROWTH:

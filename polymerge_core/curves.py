@@ -6,7 +6,7 @@ stretch may run over the first vertex; a stretch whose end comes before its star
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-
 
 #: Places along lines nearer to each other than this are the same, metres.
 _SAME = 1e-9
@@ -159,6 +158,12 @@ def distinct(values: Index) -> Index:
     """Return the distinct values, rising: `numpy.unique` by sorting, which is several times faster for so many."""
     ordered = np.sort(values)
     return ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
+
+
+def best_of_each(owner: Index, score: NDArray[Any], tie: NDArray[Any]) -> Index:
+    """Return the row of each owner with the highest score, of equal ones (to 1e-9) that with the least `tie`."""
+    order = np.lexsort((tie, -np.round(score, 9), owner))
+    return order[np.diff(owner[order], prepend=-1) != 0]
 
 
 def turning(curves: Curves) -> Array:

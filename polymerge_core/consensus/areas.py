@@ -1,8 +1,8 @@
 """The consensus of areas: as many corners as the evidence has, each at the mean of what was seen of it.
 
-Looks at one area overlap; two areas that one local map saw side by side are different. Of the looks that hold the area
-whole (those that do not end at the edge of what their local map looked at) the corners are brought into one order and
-averaged, robustly, so that a skewed crossing stays skewed.
+Looks at one area overlap; two areas that one local map saw side by side are different. The looks that hold their area
+whole (those that do not end at the edge of what their local map looked at) say which areas there are and how many
+corners each has; every corner is the robust mean of what was seen of it, so that a skewed crossing stays skewed.
 """
 
 from __future__ import annotations
@@ -38,9 +38,6 @@ _SAME_CORNER = 2.0
 
 #: Median distance to standard deviation along each axis, for normal errors in the plane.
 _RAYLEIGH = 1.1774
-
-#: Squares by which chances of a sighting are learned, proximities.
-_SQUARE = 5.0
 
 
 class Areas(NamedTuple):
@@ -114,7 +111,7 @@ def merge_looks_at_areas(
     sigma = np.array([error for _, error in fused])
     pairs = distinct(group * len(instances) + instance)
     places = shapely.get_coordinates(shapely.centroid(shapes))
-    support = judge(places, pairs, instances, _SQUARE * unit)
+    support = judge(places, pairs, instances, unit)
     past = np.zeros((len(shapes), len(Support._fields)))
     np.add.at(past, group[count:], before.support)
     support = Support._make(new + old for new, old in zip(support, past.T, strict=True))

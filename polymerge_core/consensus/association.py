@@ -152,6 +152,7 @@ class _Linkage:
         links = self._links
         for instance, length in self._seen[second].items():
             self._seen[first][instance] = self._seen[first].get(instance, 0.0) + length
+        self._seen[second] = {}
         self._into[second] = first
         del links[first][second]
         for other, link in links[second].items():

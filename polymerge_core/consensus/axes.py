@@ -29,7 +29,7 @@ _DIFFERENCE = (-1.0, 3.0, -3.0, 1.0)
 _MOST = 3.0
 
 #: Metres between two lines on the axis that tells them apart: more than any map is wide.
-LINE_APART = 1e9
+_APART = 1e9
 
 #: Stations of a ring that are smoothed with it once more at either end.
 _AROUND = 30
@@ -100,14 +100,11 @@ class Axes:
 
     @cached_property
     def _tree(self) -> cKDTree:
-        # Lines are told apart by a third axis, on which they are farther from each other than anything on the plane.
-        return cKDTree(
-            np.column_stack([self.stations, LINE_APART * self.line]), balanced_tree=False, compact_nodes=False
-        )
+        return cKDTree(told_apart(self.stations, self.line), balanced_tree=False, compact_nodes=False)
 
     def feet(self, points: Array, line: Index, unit: float) -> Feet:
         """Project points onto given lines: to the segment before or after the nearest station."""
-        _, station = self._tree.query(np.column_stack([points, LINE_APART * line]), workers=-1)
+        _, station = self._tree.query(told_apart(points, line), workers=-1)
         before = np.maximum(station - 1, self.first[line])
         after = np.minimum(station + 1, self.first[line] + self.counts[line] - 1)
         ring = self.curves.closed[line]
@@ -183,6 +180,11 @@ class Axes:
         wrapped = np.where(ring[owner], place % around[owner], place)
         middle = (np.cumsum(sizes) - sizes + more)[self.line] + np.arange(len(self.line)) - self.first[self.line]
         return self.first[owner] + wrapped, owner, middle
+
+
+def told_apart(points: Array, line: Index) -> Array:
+    """Return points with a third axis, on which those of two lines are farther apart than anything on the plane."""
+    return np.column_stack([points, _APART * line])
 
 
 def smooth(values: Array, weight: Array, series: Index, strength: float) -> Array:

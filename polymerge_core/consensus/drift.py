@@ -15,9 +15,9 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
-from polymerge_core.consensus.axes import LINE_APART
+from polymerge_core.consensus.axes import told_apart
 from polymerge_core.consensus.fusion import HALF_WEIGHT, Fit
-from polymerge_core.consensus.looks import DRIVES, Looks
+from polymerge_core.consensus.looks import DRIVES, Looks, dot
 from polymerge_core.curves import Array, Index
 
 #: Standard deviation that is held likely of a drive's shift, proximities.
@@ -95,7 +95,7 @@ def pulls(tracks: Looks, fit: Fit, drift: Drift) -> Pulls:
     normal /= np.maximum(np.hypot(*normal.T), np.finfo(float).tiny)[:, None]
     place = np.column_stack([mean(axis) for axis in tracks.points[rows].T])
     residual, sigma = mean(fit.feet.lateral[rows]), np.sqrt(mean(fit.sigma[rows] ** 2))
-    before = (normal * drift.at(drive, place)).sum(axis=1)
+    before = dot(normal, drift.at(drive, place))
     variance = sigma**2 * (1 + (residual / (HALF_WEIGHT * sigma)) ** 2)
     drives = np.maximum(mean(np.nan_to_num(tracks.past[rows, DRIVES], nan=1.0)), 1.0)
     return Pulls(drive, place, normal, before - residual, variance, drives)
@@ -116,7 +116,7 @@ def estimate_drift(pulls: list[Pulls], unit: float) -> Drift:
         return no_drift()
     reach = _RANGE * unit
     alike = _kernel(every.drive, every.place, every.drive, every.place, reach).tocoo()
-    together = (every.normal[alike.row] * every.normal[alike.col]).sum(axis=1)
+    together = dot(every.normal[alike.row], every.normal[alike.col])
     # The mean of several drives strays less.
     likely = _SHIFT * unit / np.sqrt(every.drives)
     covariance = likely[alike.row] * likely[alike.col] * together * alike.data
@@ -127,9 +127,7 @@ def estimate_drift(pulls: list[Pulls], unit: float) -> Drift:
 
 def _kernel(drive: Index, points: Array, others: Index, places: Array, reach: float) -> csr_array:
     """Return how alike the shifts are at points and places of the same drive: 1 at no distance, 0 from `reach` on."""
-    trees = [
-        cKDTree(np.column_stack([where, LINE_APART * which])) for where, which in ((points, drive), (places, others))
-    ]
+    trees = [cKDTree(told_apart(where, which)) for where, which in ((points, drive), (places, others))]
     near = trees[0].sparse_distance_matrix(trees[1], reach, output_type="coo_matrix")
     share = near.data / reach
     value = (1 - share) ** 4 * (4 * share + 1)

@@ -17,11 +17,11 @@ from polymerge_core.consensus.axes import Axes
 from polymerge_core.consensus.drift import Drift, estimate_drift, no_drift, pulls
 from polymerge_core.consensus.fusion import FIRST_NOISE, SHARED, Noise, fuse
 from polymerge_core.consensus.known import remembering
-from polymerge_core.consensus.looks import Instances, Looks
+from polymerge_core.consensus.looks import PAST, Instances, Looks
 from polymerge_core.consensus.membership import line_along
 from polymerge_core.consensus.support import shapes_of, stretch_of, support, supported_stretches
 from polymerge_core.consensus.tracing import State, moved, trace
-from polymerge_core.curves import Array, Index
+from polymerge_core.curves import Array, Index, best_of_each
 
 #: How often the lines of the drives are put together, each time after the drives were shifted anew.
 _DRIFTS = 3
@@ -30,7 +30,9 @@ _DRIFTS = 3
 _SHORT_TRACK = 3
 
 #: Columns of `PAST` that tell of drives what the others tell of local maps.
-_OF_DRIVES = [3, 3, 4, 3, 4]
+_OF_DRIVES = [
+    PAST.index(name) for name in ("seen_drives", "seen_drives", "expected_drives", "seen_drives", "expected_drives")
+]
 
 
 def join_drives(states: list[State], centre: Array) -> tuple[list[State], Array, Drift]:
@@ -139,7 +141,7 @@ def _cut(tracks: _Tracks, joined: State) -> _Tracks:
     # The same points of the tracks as they were before they were shifted.
     start = np.flatnonzero(np.diff(tracks.looks.owner, prepend=-1))
     there = tracks.track >= 0
-    place = np.where(there, start[tracks.track] + tracks.point, 0) if len(start) else tracks.track
+    place = np.where(there, start[tracks.track] + tracks.point, 0)
     track = np.where(there, name[run[place]], -1)
     number = np.where(track >= 0, place - first[run[place]], 0)
     inside = np.flatnonzero(name[run] >= 0)
@@ -159,8 +161,7 @@ def _track_of_looks(state: State, tracks: _Tracks) -> Index:
     count = len(tracks.looks) + 1
     votes, place = np.unique(looks.owner * count + tracks.track[state.fit.feet.station] + 1, return_inverse=True)
     metres = np.bincount(place, looks.metres)
-    order = np.lexsort((votes, -metres.round(9), votes // count))
-    best = order[np.diff(votes[order] // count, prepend=-1) != 0]
+    best = best_of_each(votes // count, metres, votes)
     return np.asarray(votes[best] % count - 1)
 
 

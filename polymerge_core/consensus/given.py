@@ -61,8 +61,9 @@ class Given:
         shapes = self.table["shape"].to_numpy(dtype=object)
         return Looks.of(shapes[rows], self.instance[rows], self.weight[rows], self.instances, self.unit)
 
-    def follow(self, shapes: NDArray[np.object_], looks: list[Looks], corrections: Array) -> NDArray[np.object_]:
+    def followed(self, looks: list[Looks], corrections: Array) -> NDArray[np.object_]:
         """Return the shapes of all observations, areas moved as the lines say that their local maps were off."""
+        shapes = self.table["shape"].to_numpy(dtype=object, copy=True)
         rows = np.concatenate([rows for _, rows in self.areas]) if self.areas else np.empty(0, np.intp)
         if looks and len(rows):
             centre = centres(looks, len(self.instances))

@@ -14,7 +14,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from polymerge_core.consensus.axes import LINE_APART, Axes
+from polymerge_core.consensus.axes import Axes, told_apart
 from polymerge_core.consensus.looks import PAST, Instances, Looks
 from polymerge_core.consensus.support import Support, stretches_of
 from polymerge_core.curves import Array, Index
@@ -39,17 +39,14 @@ class KnownLines(NamedTuple):
 
 def remembering(looks: Looks, line: Index, places: Array, of_line: Index, past: Array) -> Looks:
     """Return looks whose points remember what is known of the nearest place of their line, `line` of each point."""
-    tree = cKDTree(np.column_stack([places, LINE_APART * of_line]))
-    _, nearest = tree.query(np.column_stack([looks.points, LINE_APART * line]), workers=-1)
+    _, nearest = cKDTree(told_apart(places, of_line)).query(told_apart(looks.points, line), workers=-1)
     return looks.remembering(past[nearest])
 
 
 def known_lines(axes: Axes, knowledge: Array, support: Support) -> KnownLines:
     """Return what is known after a merge, without the stretches that nobody saw."""
     found = stretches_of(axes, support.seen > 0)
-    size = found.last - found.first + 1
-    line = np.repeat(np.arange(len(size)), size)
-    rows = np.arange(len(line)) - np.repeat(np.cumsum(size) - size, size) + np.repeat(found.first, size)
+    rows, line = found.stations
     past = np.column_stack([knowledge, *support])
     return KnownLines(axes.stations[rows], line, past[rows])
 

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from polymerge_core.consensus.drift import Drift, no_drift
@@ -20,7 +19,7 @@ from polymerge_core.consensus.drives import join_drives
 from polymerge_core.consensus.known import KnownLines, known_lines
 from polymerge_core.consensus.looks import Looks
 from polymerge_core.consensus.registration import centres, corrections, equations
-from polymerge_core.consensus.support import Stretches, Support, shapes_of, stretch_of, support, supported_stretches
+from polymerge_core.consensus.support import means, shapes_of, stretch_of, support, supported_stretches
 from polymerge_core.consensus.tracing import State, moved, trace
 from polymerge_core.curves import Array, Index
 
@@ -110,15 +109,4 @@ def _finish(state: State) -> Lines:
     shapes = shapes_of(fit.axes.stations, stretches, _TOLERANCE * looks.unit)
     element = stretch_of(stretches, fit.feet.station)
     known = known_lines(fit.axes, fit.knowledge, found)
-    return Lines(shapes, *_means(found, fit.error, stretches), element, known)
-
-
-def _means(found: Support, error: Array, stretches: Stretches) -> tuple[Array, Array, Array]:
-    """Return the median standard error and the mean support of each stretch."""
-    stretch = stretch_of(stretches, np.arange(len(error)))
-    inside = stretch >= 0
-    sigma = pd.Series(error[inside]).groupby(stretch[inside]).median().to_numpy()
-    totals = [np.concatenate([[0.0], np.cumsum(values)]) for values in (found.seen, found.expected)]
-    size = stretches.last - stretches.first + 1
-    seen, expected = ((total[stretches.last + 1] - total[stretches.first]) / size for total in totals)
-    return sigma, seen, expected
+    return Lines(shapes, *means(found, fit.error, stretches), element, known)

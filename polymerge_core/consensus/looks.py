@@ -125,7 +125,7 @@ class Looks:
         arc = number * (curves.length / (counts - 1))[owner]
         tangent = direction_at(curves, owner, arc, _HALF_CHORD * unit)
         metres = (curves.length / counts)[owner]
-        unknown = np.full((len(owner), len(PAST)), np.nan)
+        unknown = np.broadcast_to(np.nan, (len(owner), len(PAST)))
         return cls(curves, instance, weight, instances, unit, owner, arc, metres, points, tangent, unknown)
 
     def __len__(self) -> int:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from polymerge_core.consensus.alongside import ANGLE_DEG, REACH
 from polymerge_core.consensus.axes import Axes
 from polymerge_core.consensus.looks import Looks, cross, dot
-from polymerge_core.curves import Array, Index, distinct
+from polymerge_core.curves import Array, Index, best_of_each, distinct
 
 #: Stations of lines that are looked at for each point.
 _NEAREST = 8
@@ -73,8 +73,7 @@ def line_along(looks: Looks, axes: Axes) -> Index:
     much = (np.bincount(place, metres) > looks.curves.length[key // len(axes.counts)] / 2) & (agrees > 0)
     key, agrees = key[much], agrees[much]
     look = key // len(axes.counts)
-    order = np.lexsort((-np.round(agrees, 9), look))
-    best = order[np.diff(look[order], prepend=-1) != 0]
+    best = best_of_each(look, agrees, key)
     found = np.full(len(looks), -1)
     found[look[best]] = key[best] % len(axes.counts)
     return found
@@ -121,8 +120,7 @@ def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
     key, place = np.unique(owner * lines + beside.line, return_inverse=True)
     total = np.bincount(place, agrees)
     look, line = key // lines, key % lines
-    order = np.lexsort((line != group[look], -np.round(total, 9), look))
-    best = order[np.diff(look[order], prepend=-1) != 0]
+    best = best_of_each(look, total, line != group[look])
     best = best[total[best] > 0]
     settled = group.copy()
     settled[look[best]] = line[best]

@@ -15,6 +15,7 @@ from polymerge_core.consensus.areas import Areas
 from polymerge_core.consensus.given import read_looks
 from polymerge_core.consensus.lines import Lines, merge_lines
 from polymerge_core.consensus.looks import Looks
+from polymerge_core.consensus.support import succession
 from polymerge_core.curves import Array, Curves, Index
 from polymerge_core.observations import MIN_SEGMENT_M, Observations
 from polymerge_core.options import Options
@@ -89,10 +90,9 @@ def merge_by_consensus(
         If the proximity is too small for so much length.
     """
     given = read_looks(observations, local_maps, options)
-    shapes = observations.table["shape"].to_numpy(dtype=object).copy()
     looks = [given.looks_of(rows) for _, rows in given.lines]
     lines, corrections, _ = merge_lines(looks, lambda share: advance(0.9 * share))
-    shapes = given.follow(shapes, looks, corrections)
+    shapes = given.followed(looks, corrections)
     found: list[Lines | Areas] = []
     pieces: list[_Pieces] = []
     for (_, rows), each, seen in zip(given.lines, lines, looks, strict=True):
@@ -187,7 +187,7 @@ def _put_together(
     total = np.bincount(component, kept["weight"], len(used))
     mean = np.bincount(component, kept["weight"] * kept["score"], len(used)) / np.maximum(total, 1)
     # The rule of succession: how surely one that looks there sees it, where it is known who looked there.
-    surely = np.where(expected > 0, (seen + 1) / (np.maximum(expected, seen) + 2), 1.0)
+    surely = np.where(expected > 0, succession(seen, expected), 1.0)
     confidence = mean * surely
     return Consensus(chosen, sets, shapes, {"score": confidence.astype(float), "sigma_m": sigma}, corrections)
 

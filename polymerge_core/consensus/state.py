@@ -2,7 +2,8 @@
 
 A `State` holds the lines and areas of every class, also those that too few local maps saw so far, as `KnownLines` and
 `KnownAreas` do: at every station of a line how much is known of it, how many local maps and drives saw it, and how many
-should have. What is added to it is registered to it; it stays where it is.
+should have. What is added to it and what is known are registered to each other, each shifted by its share: by the
+number of drives behind it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from polymerge_core.consensus.given import Given, read_looks
 from polymerge_core.consensus.known import KnownAreas, KnownLines
 from polymerge_core.consensus.lines import merge_lines
 from polymerge_core.consensus.looks import Looks
-from polymerge_core.consensus.support import Support, shapes_of, supported_stretches
+from polymerge_core.consensus.support import Support, means, shapes_of, succession, supported_stretches
 from polymerge_core.errors import CrsError, OptionError
 from polymerge_core.observations import as_lines, observe
 from polymerge_core.options import Options
@@ -75,15 +76,15 @@ class State:
         parts += [_area_elements(name, areas) for name, areas in sorted(self.areas.items())]
         columns = ["class", "seen", "expected", "sigma_m", "geometry"]
         table = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
-        table["score"] = (table["seen"] + 1) / (np.maximum(table["expected"], table["seen"]) + 2)
+        table["score"] = succession(*table[["seen", "expected"]].to_numpy(dtype=float).T)
         return gpd.GeoDataFrame(table, geometry="geometry", crs=self.crs)
 
 
 def accumulate(local_maps: Input, state: State | None = None, **options: Any) -> State:
     """Merge local maps by consensus, onto what is known from others.
 
-    Merging A and then adding B gives what merging A and B at once gives, but for rounding and for what B would have
-    said of the poses of A, which are not corrected any more.
+    Merging A and then adding B gives nearly what merging A and B at once gives: what B would have said of the poses of
+    A is not heard any more.
 
     Parameters
     ----------
@@ -128,7 +129,7 @@ def _added(given: Given, state: State | None, crs: pyproj.CRS) -> State:
         looked = None if looked is None or state.looked is None else shapely.union(looked, state.looked)
     names, looks = _looks(given, state)
     lines, corrections, drift = merge_lines(looks, lambda _: None)
-    shapes = given.follow(given.table["shape"].to_numpy(dtype=object).copy(), looks, corrections)
+    shapes = given.followed(looks, corrections)
     before = {} if state is None else {name: _shifted(areas, drift, given) for name, areas in state.areas.items()}
     new = dict(given.areas)
     nothing = np.empty(0, np.intp)
@@ -170,17 +171,10 @@ def _line_elements(name: str, known: KnownLines) -> pd.DataFrame:
     axes, support = Axes(known.stations, known.line), Support(*known.past[:, 1:].T)
     found = supported_stretches(axes, support)
     # A bridged gap has nothing that is known of it.
-    sigma = 1 / np.sqrt(np.maximum(known.past[:, 0], np.finfo(float).tiny))
-    rows = [np.arange(first, last + 1) for first, last in zip(found.first, found.last, strict=True)]
-    return pd.DataFrame(
-        {
-            "class": name,
-            "seen": [float(support.seen[row].mean()) for row in rows],
-            "expected": [float(support.expected[row].mean()) for row in rows],
-            "sigma_m": [float(np.median(sigma[row])) for row in rows],
-            "geometry": list(shapes_of(known.stations, found, 0.0)),
-        }
-    )
+    error = 1 / np.sqrt(np.maximum(known.past[:, 0], np.finfo(float).tiny))
+    sigma, seen, expected = means(support, error, found)
+    columns = {"class": name, "seen": seen, "expected": expected, "sigma_m": sigma}
+    return pd.DataFrame({**columns, "geometry": list(shapes_of(known.stations, found, 0.0))})
 
 
 def _area_elements(name: str, known: KnownAreas) -> pd.DataFrame:

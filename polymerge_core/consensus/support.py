@@ -10,14 +10,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from polymerge_core.consensus.axes import LINE_APART, Axes
+from polymerge_core.consensus.axes import Axes, told_apart
 from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.membership import points_beside, sightings
-from polymerge_core.curves import Array, Index, distinct
+from polymerge_core.curves import Array, Index, count_up, distinct
 
 #: What is seen as often as expected is seen so by chance now and then: fewer than this times the square root of what is
 #: expected is too few ...
@@ -65,12 +66,23 @@ class Stretches(NamedTuple):
     first: Index
     last: Index
 
+    @property
+    def size(self) -> Index:
+        """How many stations each has."""
+        return self.last - self.first + 1
+
+    @property
+    def stations(self) -> tuple[Index, Index]:
+        """The stations of all, and the stretch that each is in."""
+        owner, number = count_up(self.size)
+        return self.first[owner] + number, owner
+
 
 def support(looks: Looks, group: Index, axes: Axes, drive: Index | None = None) -> Support:
     """Count who saw each station, and who should have; of `drive` alone, the drive of each line, where it is given."""
     pairs = _sightings(looks, group, axes)
     of_station = None if drive is None else drive[axes.line]
-    found = judge(axes.stations, pairs, looks.instances, _SQUARE * looks.unit, of_station)
+    found = judge(axes.stations, pairs, looks.instances, looks.unit, of_station)
     before = _before(looks, group, axes)
     return Support._make(axes.around(new + old) for new, old in zip(found, before.T, strict=True))
 
@@ -81,15 +93,15 @@ def _before(looks: Looks, group: Index, axes: Axes) -> Array:
     rows = np.flatnonzero(np.isfinite(looks.knowledge))
     if len(rows) == 0:
         return counts
-    tree = cKDTree(np.column_stack([looks.points[rows], LINE_APART * group[looks.owner[rows]]]))
-    there = np.column_stack([axes.stations, LINE_APART * axes.line])
-    distance, nearest = tree.query(there, distance_upper_bound=_NEAR * looks.unit, workers=-1)
+    tree = cKDTree(told_apart(looks.points[rows], group[looks.owner[rows]]))
+    there, far = told_apart(axes.stations, axes.line), _NEAR * looks.unit
+    distance, nearest = tree.query(there, distance_upper_bound=far, workers=-1)
     near = np.isfinite(distance)
     counts[near] = looks.past[rows[nearest[near]], 1:]
     return counts
 
 
-def judge(places: Array, pairs: Index, instances: Instances, square: float, drive: Index | None = None) -> Support:
+def judge(places: Array, pairs: Index, instances: Instances, unit: float, drive: Index | None = None) -> Support:
     """Count who saw each place, and who should have.
 
     Parameters
@@ -100,13 +112,13 @@ def judge(places: Array, pairs: Index, instances: Instances, square: float, driv
         ``place * len(instances) + instance`` of every sighting; rising.
     instances : Instances
         The local maps.
-    square : float
-        Side of the squares, in the vehicle's frame, by which the chance of a sighting is learned, metres.
+    unit : float
+        The proximity, metres.
     drive : ndarray of int, shape (s,), optional
         Only local maps of this drive are expected to see the place.
     """
     count, drives = len(instances), int(instances.drive.max(initial=-1)) + 1
-    pairs = pairs[pairs % count != instances.known] if instances.known >= 0 else pairs
+    pairs = pairs[pairs % count != instances.known]
     seen = np.bincount(pairs // count, minlength=len(places)) if len(pairs) else np.zeros(len(places), np.intp)
     seen_by = distinct(pairs // count * drives + instances.drive[pairs % count])
     seen_drives = np.bincount(seen_by // drives, minlength=len(places)) if len(pairs) else seen
@@ -118,7 +130,7 @@ def judge(places: Array, pairs: Index, instances: Instances, square: float, driv
         own = instances.drive[instance] == drive[place]
         instance, place = instance[own], place[own]
     saw = np.isin(place * count + instance, pairs)
-    chance = _chances(places[place], instances, instance, saw, (seen >= SURE)[place], square)
+    chance = _chances(places[place], instances, instance, saw, (seen >= SURE)[place], _SQUARE * unit)
     expected = np.bincount(place, chance, minlength=len(places)).astype(float)
     # A drive should have seen what one of its local maps at least should have.
     passed, inverse = np.unique(place * drives + instances.drive[instance], return_inverse=True)
@@ -137,12 +149,27 @@ def _chances(
     sine, cosine = np.sin(instances.heading[instance]), np.cos(instances.heading[instance])
     ahead = np.nan_to_num(cosine * offset[:, 0] + sine * offset[:, 1])
     aside = np.nan_to_num(cosine * offset[:, 1] - sine * offset[:, 0])
-    cells = np.floor(np.column_stack([ahead, aside]) / square).astype(np.intp)
-    cell = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    row, column = (np.floor(along / square).astype(np.intp) for along in (ahead, aside))
+    width = int(np.ptp(column)) + 1 if len(column) else 1
+    _, cell = np.unique(row * width + column, return_inverse=True)
     overall = saw[sure].mean() if sure.any() else saw.mean() if len(saw) else 0.0
     # A square that few sure lines fell into takes after the others.
     chance = (np.bincount(cell, saw & sure) + overall) / (np.bincount(cell, sure) + 1.0)
     return np.asarray(chance[cell])
+
+
+def succession(seen: Array, expected: Array) -> Array:
+    """Return how surely one that looks there sees it, by the rule of succession."""
+    return np.asarray((seen + 1) / (np.maximum(expected, seen) + 2), dtype=np.float64)
+
+
+def means(support: Support, error: Array, stretches: Stretches) -> tuple[Array, Array, Array]:
+    """Return of each stretch the median standard error, metres, and who saw it and should have, in the mean."""
+    rows, owner = stretches.stations
+    sigma = pd.Series(error[rows]).groupby(owner).median().to_numpy()
+    totals = [np.concatenate([[0.0], np.cumsum(values)]) for values in (support.seen, support.expected)]
+    seen, expected = ((total[stretches.last + 1] - total[stretches.first]) / stretches.size for total in totals)
+    return sigma, seen, expected
 
 
 def _enough(seen: Index, expected: Array) -> NDArray[np.bool_]:
@@ -195,9 +222,7 @@ def stretch_of(stretches: Stretches, station: Index) -> NDArray[np.intp]:
 
 def shapes_of(stations: Array, stretches: Stretches, tolerance: float) -> NDArray[np.object_]:
     """Return stretches as lines without vertices that leave them where they are within a tolerance, metres."""
-    size = stretches.last - stretches.first + 1
-    owner = np.repeat(np.arange(len(size)), size)
-    rows = np.arange(len(owner)) - np.repeat(np.cumsum(size) - size, size) + stretches.first[owner]
+    rows, owner = stretches.stations
     if len(owner) == 0:
         return np.empty(0, dtype=object)
     drawn = shapely.linestrings(stations[rows], indices=owner)
