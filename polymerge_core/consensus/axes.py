@@ -102,9 +102,50 @@ class Axes:
     def _tree(self) -> cKDTree:
         return cKDTree(told_apart(self.stations, self.line), balanced_tree=False, compact_nodes=False)
 
-    def feet(self, points: Array, line: Index, unit: float) -> Feet:
-        """Project points onto given lines: to the segment before or after the nearest station."""
+    def nearest(self, points: Array, line: Index) -> Index:
+        """Return the station of each point's line that is nearest to it."""
         _, station = self._tree.query(told_apart(points, line), workers=-1)
+        return np.asarray(station, dtype=np.intp)
+
+    def walked(self, points: Array, line: Index, station: Index) -> Index:
+        """Return the stations to which one comes from given ones by going along each point's line ever nearer to it."""
+        station, x, y = station.copy(), *self.stations.T
+        low, last = self.first[line], self.counts[line] - 1
+        ring = self.curves.closed[line]
+
+        def distance(rows: Index, there: Index) -> Array:
+            return np.asarray((x[there] - points[rows, 0]) ** 2 + (y[there] - points[rows, 1]) ** 2)
+
+        every = np.arange(len(points))
+        nearest = distance(every, station)
+        for step in (1, -1):
+            rows = every
+            while len(rows):
+                number = station[rows] - low[rows] + step
+                # A ring goes on past its last station, which is its first.
+                number = np.where(ring[rows], number % last[rows], np.clip(number, 0, last[rows]))
+                there = low[rows] + number
+                far = distance(rows, there)
+                nearer = far < nearest[rows]
+                rows, there = rows[nearer], there[nearer]
+                station[rows], nearest[rows] = there, far[nearer]
+        return station
+
+    def feet(self, points: Array, line: Index, unit: float, near: Index | None = None) -> Feet:
+        """Project points onto given lines: to the segment before or after the nearest station.
+
+        Parameters
+        ----------
+        points : ndarray of float, shape (p, 2)
+            Metres.
+        line : ndarray of int, shape (p,)
+            The line of each.
+        unit : float
+            The proximity, metres.
+        near : ndarray of int, shape (p,), optional
+            A station of the line of each that is near it, where that is known already.
+        """
+        station = self.nearest(points, line) if near is None else self.walked(points, line, near)
         before = np.maximum(station - 1, self.first[line])
         after = np.minimum(station + 1, self.first[line] + self.counts[line] - 1)
         ring = self.curves.closed[line]
@@ -135,6 +176,12 @@ class Axes:
         alike = values.copy()
         alike[self.first[ring] + self.counts[ring] - 1] = values[self.first[ring]]
         return alike
+
+    def again(self, axes: Axes, station: Index) -> Index:
+        """Return the stations that lie where stations of the same lines, drawn with other steps, lie."""
+        line = axes.line[station]
+        share = (station - axes.first[line]) / np.maximum(axes.counts[line] - 1, 1)
+        return self.first[line] + np.round(share * (self.counts[line] - 1)).astype(np.intp)
 
     def reaching(self, feet: Feet, line: Index) -> Axes:
         """Return the lines drawn out, or back, to where the first and the last of their points lie."""

@@ -86,7 +86,9 @@ class Noise:
         return cls(np.full(len(looks.points), FIRST_NOISE * looks.unit))
 
 
-def fuse(looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 2) -> Fit:
+def fuse(
+    looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 2, near: Index | None = None
+) -> Fit:
     """Fit lines to their looks.
 
     Parameters
@@ -101,6 +103,8 @@ def fuse(looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 
         What is known of the errors.
     rounds : int, default 2
         How often the lines are moved and the looks projected onto them anew.
+    near : ndarray of int, shape (p,), optional
+        A station of its line that is near each point, where that is known already.
 
     Returns
     -------
@@ -109,20 +113,23 @@ def fuse(looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 
     """
     line = group[looks.owner]
     knowledge = error = np.empty(0)
+    feet = axes.feet(looks.points, line, looks.unit, near)
+    used = np.zeros(len(line), dtype=bool)
     for _ in range(rounds):
-        axes = axes.reaching(axes.feet(looks.points, line, looks.unit), line).spaced(looks.unit)
-        feet, used = _feet(looks, axes, line)
+        even = axes.reaching(feet, line).spaced(looks.unit)
+        feet, used = _feet(looks, even, line, even.again(axes, feet.station))
+        axes = even
         offset, weight, error, knowledge = map(axes.around, _offsets(looks, feet, used, noise, len(axes.line)))
         # Rounding must not open a ring.
         moved = axes.around(axes.stations + offset[:, None] * axes.normal)
         axes = Axes(moved, axes.line).smoothed(weight)
-    feet, used = _feet(looks, axes, line)
+        feet, used = _feet(looks, axes, line, feet.station)
     sigma = _noise_by_distance(looks, group, feet, used)
     return Fit(axes, feet, used, sigma, _noise_of_drives(looks, feet, used, sigma), knowledge, error)
 
 
-def _feet(looks: Looks, axes: Axes, line: Index) -> tuple[Feet, NDArray[np.bool_]]:
-    feet = axes.feet(looks.points, line, looks.unit)
+def _feet(looks: Looks, axes: Axes, line: Index, near: Index) -> tuple[Feet, NDArray[np.bool_]]:
+    feet = axes.feet(looks.points, line, looks.unit, near)
     return feet, feet.beside & (np.abs(feet.lateral) <= 2 * REACH * looks.unit)
 
 

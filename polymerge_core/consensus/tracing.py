@@ -66,7 +66,7 @@ def moved(state: State, step: Array, centre: Array) -> State:
     """Move the local maps, and fit the lines anew."""
     looks = corrected(state.looks, step, centre)
     noise = Noise(state.fit.sigma, state.fit.drive_sigma)
-    return State(looks, state.group, fuse(looks, state.group, state.fit.axes, noise, rounds=1))
+    return State(looks, state.group, fuse(looks, state.group, state.fit.axes, noise, rounds=1, near=state.fit.feet.station))
 
 
 def _connected(looks: Looks, pairs: Pairs, group: Index) -> Index:
