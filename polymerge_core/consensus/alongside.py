@@ -5,14 +5,16 @@ Alongside is more than near: two lines that touch end to end, cross or fork are 
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from polymerge_core.consensus.looks import Looks, cross, direction_at, dot
-from polymerge_core.curves import Array, Index, count_up
+from polymerge_core.consensus.axes import Axes
+from polymerge_core.consensus.looks import Looks, dot
+from polymerge_core.curves import Array, Index, best_of_each, count_up
 
 #: Looks farther apart than this many proximities are never compared.
 REACH = 2.5
@@ -22,6 +24,12 @@ ANGLE_DEG = 35.0
 
 #: A pair is looked at every two proximities along the shorter one, at most so often.
 _STATIONS = 12
+
+#: Where a pair first comes close is looked for at every so manieth point of the longer look.
+_COARSE = 8
+
+#: Pairs that are measured at a time, so that what is worked out on the way stays small.
+_BLOCK = 20_000
 
 
 class Pairs(NamedTuple):
@@ -64,27 +72,53 @@ def pairs_alongside(looks: Looks, kind: Index) -> Pairs:
     Pairs
         Those that run beside each other over two proximities, or over half of the shorter one.
     """
-    curves, unit = looks.curves, looks.unit
-    first, second = shapely.STRtree(curves.lines).query(curves.lines, predicate="dwithin", distance=2 * REACH * unit)
-    once = (first < second) & (kind[first] == kind[second])
-    first, second = first[once], second[once]
-    shorter = curves.length[first] <= curves.length[second]
+    first, second = _near(looks, kind)
+    shorter = looks.curves.length[first] <= looks.curves.length[second]
     short, long = np.where(shorter, first, second), np.where(shorter, second, first)
-    counts = np.clip(np.ceil(curves.length[short] / (2 * unit)), 2, _STATIONS).astype(np.intp)
+    # The looks as lines of their points, which lie as close together as stations do.
+    drawn = Axes(looks.points, looks.owner)
+    blocks = np.array_split(np.arange(len(short)), max(1, len(short) // _BLOCK))
+    with ThreadPoolExecutor() as threads:
+        parts = list(threads.map(lambda rows: _measured(looks, drawn, short[rows], long[rows]), blocks))
+    return Pairs._make(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def _near(looks: Looks, kind: Index) -> tuple[Index, Index]:
+    """Return the pairs of looks of one kind that come near each other, each once; the first comes before the second."""
+    lines, distance = looks.curves.lines, 2 * REACH * looks.unit
+    west, south, east, north = shapely.bounds(lines).T
+    # Boxes of two kinds are told apart by where they are.
+    beyond = kind * (np.ptp([west, east]) + 2 * distance) if len(lines) else west
+    tree = shapely.STRtree(shapely.box(west + beyond, south, east + beyond, north))
+    around = shapely.box(west + beyond - distance, south - distance, east + beyond + distance, north + distance)
+    first, second = tree.query(around)
+    once = first < second
+    first, second = first[once], second[once]
+    near = shapely.dwithin(lines[first], lines[second], distance)
+    return first[near], second[near]
+
+
+def _measured(looks: Looks, drawn: Axes, short: Index, long: Index) -> Pairs:
+    """Measure pairs at some points of the shorter look against the longer one."""
+    curves, unit = looks.curves, looks.unit
+    points = drawn.counts[short]
+    counts = np.clip(points // 2, 2, _STATIONS)
     pair, number = count_up(counts)
     mine, theirs = short[pair], long[pair]
-    position = (number + 0.5) / counts[pair] * curves.length[mine]
-    place = curves.points_at(mine, position)
-    foot = curves.locate(theirs, place)
-    there = curves.points_at(theirs, foot)
-    tangent = direction_at(curves, theirs, foot, unit)
-    offset = place - there
-    lateral, ahead = cross(tangent, offset), dot(tangent, offset)
-    cosine = dot(direction_at(curves, mine, position, unit), tangent)
-    at_end = ~curves.closed[theirs] & ((foot <= 0.0) | (foot >= curves.length[theirs]))
-    beyond = at_end & (np.abs(ahead) > 0.3 * unit)
+    # Those of the second half mirror those of the first, so that the direction of digitisation does not matter.
+    back = number > counts[pair] - 1 - number
+    sample = (2 * np.where(back, counts[pair] - 1 - number, number) + 1) * points[pair] // (2 * counts[pair])
+    at = drawn.first[mine] + np.where(back, points[pair] - 1 - sample, sample)
+    place, position = drawn.stations[at], looks.arc[at]
+    feet = drawn.feet(place, theirs, unit, _beginning(drawn, place, theirs, number))
+    foot = looks.arc[feet.station] + feet.ahead
+    cosine = dot(looks.tangent[at], feet.tangent)
+    last = drawn.first + drawn.counts - 1
+    before = (feet.station == drawn.first[theirs]) & (feet.ahead < -0.3 * unit)
+    behind = (feet.station == last[theirs]) & (feet.ahead > 0.3 * unit)
+    beyond = ~curves.closed[theirs] & (before | behind)
     straight = np.abs(cosine) > np.cos(np.radians(ANGLE_DEG))
-    beside = ~beyond & straight & (np.abs(lateral) <= REACH * unit)
+    beside = ~beyond & straight & (np.abs(feet.lateral) <= REACH * unit)
 
     def total(values: Array) -> Array:
         return np.bincount(pair, values, minlength=len(short)).astype(float)
@@ -92,18 +126,37 @@ def pairs_alongside(looks: Looks, kind: Index) -> Pairs:
     seen = np.maximum(total(beside), 1)
     sense = np.where(total(np.where(beside, cosine, 0.0)) < 0, -1.0, 1.0)
     step = curves.length[short] / counts
+    there = drawn.stations[feet.station] + feet.ahead[:, None] * feet.tangent
     found = Pairs(
         short,
         long,
         total(beside) * step,
         total(~beside & ~beyond) * step,
         total(straight & ~beyond) * step,
-        total(np.where(beside, lateral**2, 0.0)) / seen,
+        total(np.where(beside, feet.lateral**2, 0.0)) / seen,
         sense,
         total(np.where(beside, foot - sense[pair] * position, 0.0)) / seen,
         total(beside & _both_looked(looks, mine, theirs, place, there)) / seen,
     )
     return found.take(found.overlap + found.apart >= np.minimum(2 * unit, 0.5 * curves.length[short]))
+
+
+def _beginning(drawn: Axes, points: Array, line: Index, number: Index) -> Index:
+    """Return a station of its line near each point: of the points 0, 1, ... of a look each leads to the next."""
+    found = np.empty(len(points), np.intp)
+    rows = np.flatnonzero(number == 0)
+    some, sample = count_up(drawn.counts[line[rows]] // _COARSE + 1)
+    station = drawn.first[line[rows]][some] + sample * _COARSE
+    station = np.minimum(station, (drawn.first + drawn.counts - 1)[line[rows]][some])
+    distance = ((drawn.stations[station] - points[rows][some]) ** 2).sum(axis=1)
+    found[rows] = station[best_of_each(some, -distance, station)]
+    while len(rows):
+        found[rows] = drawn.walked(points[rows], line[rows], found[rows])
+        after = rows[rows + 1 < len(number)] + 1
+        after = after[number[after] > 0]
+        found[after] = found[after - 1]
+        rows = after
+    return found
 
 
 def _both_looked(looks: Looks, mine: Index, theirs: Index, place: Array, there: Array) -> NDArray[np.bool_]:

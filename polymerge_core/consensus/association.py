@@ -8,12 +8,12 @@ where many local maps saw both.
 
 from __future__ import annotations
 
-import heapq
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from polymerge_core.consensus.alongside import REACH, Pairs
 from polymerge_core.consensus.looks import Looks
@@ -22,9 +22,6 @@ from polymerge_core.curves import Array, Index
 #: Groups that more than this share of the local maps of the smaller one saw side by side are different lines. Fewer
 #: only drew one twice, or invented one beside it. A local map that saw them so over half their length counts half.
 SIDE_BY_SIDE = 0.4
-
-_Link = tuple[float, float, float, float]
-
 
 def associate(looks: Looks, pairs: Pairs) -> Index:
     """Group looks at the same line.
@@ -93,85 +90,62 @@ def link_groups(instance: Index, size: Array, links: Links, unit: float) -> Inde
     ndarray of int, shape (n,)
         The group of each look, numbered from 0 in the order of their first looks.
     """
-    linkage = _Linkage(instance.tolist(), size.tolist(), unit)
-    values = zip(*(column.tolist() for column in links[2:]), strict=True)
-    for first, second, link in zip(links.first.tolist(), links.second.tolist(), values, strict=True):
-        linkage.link(first, second, link)
-    return linkage.run()
+    group = np.arange(len(instance))
+    seen = csr_array((size, (group, instance)), shape=(len(group), int(instance.max(initial=0)) + 1))
+    links = links.take(links.metres > 0)
+    while True:
+        # What is too far apart with all that it has links with stays so: a mean lies between what it is the mean of.
+        cost = _costs(links, unit)
+        open_to = np.zeros(seen.shape[0], dtype=bool)
+        for end in (links.first, links.second):
+            open_to[end[cost < 1.0]] = True
+        alive = open_to[links.first] & open_to[links.second]
+        links, cost = links.take(alive), cost[alive]
+        near = _mutually_nearest(links, np.where(_apart(links, seen), np.inf, cost), seen.shape[0])
+        if len(near) == 0:
+            return pd.factorize(group)[0]
+        into = np.arange(seen.shape[0])
+        into[links.second[near]] = links.first[near]
+        kept, new = np.unique(into, return_inverse=True)
+        group, links = new[group], _joined(links, new)
+        seen = csr_array((np.ones(len(new)), (new, np.arange(len(new)))), shape=(len(kept), len(new))) @ seen
 
 
-class _Linkage:
-    """Groups of looks, the links between them, and which two are to be put together next."""
-
-    def __init__(self, instance: list[int], size: list[float], unit: float) -> None:
-        #: How much of each group each local map saw.
-        self._seen = [{one: length} for one, length in zip(instance, size, strict=True)]
-        self._links: list[dict[int, _Link]] = [{} for _ in size]
-        self._into = list(range(len(size)))
-        self._heap: list[tuple[float, int, int]] = []
-        self._square = unit**2
-
-    def link(self, first: int, second: int, link: _Link) -> None:
-        self._links[first][second] = self._links[second][first] = link
-        self._offer(first, second, link)
-
-    def _offer(self, first: int, second: int, link: _Link) -> None:
-        cost = self._cost(first, second, link)
-        if cost < 1.0:
-            self._heap.append((cost, min(first, second), max(first, second)))
-
-    def _cost(self, first: int, second: int, link: _Link) -> float:
-        """Return the mean square distance of groups as a share of the limit; infinite where they must stay apart."""
-        square, metres, covisible, side_by_side = link
-        if metres <= 0 or (side_by_side > 0 and self._apart(first, second, side_by_side)):
-            return np.inf
-        return square / metres / (self._square * (1 + (REACH**2 - 1) * covisible / metres))
-
-    def _apart(self, first: int, second: int, side_by_side: float) -> bool:
-        """Tell whether too many local maps saw both groups, side by side over much of what they saw."""
-        one, other = self._seen[first], self._seen[second]
-        few, many = (one, other) if len(one) <= len(other) else (other, one)
-        both = few.keys() & many.keys()
-        length = sum(min(few[instance], many[instance]) for instance in sorted(both))
-        return min(1.0, side_by_side / length) * len(both) > SIDE_BY_SIDE * len(few)
-
-    def run(self) -> Index:
-        """Put groups together, the closest first, while any two are close enough."""
-        heapq.heapify(self._heap)
-        while self._heap:
-            cost, first, second = heapq.heappop(self._heap)
-            link = self._links[first].get(second)
-            if link is not None and self._cost(first, second, link) == cost:
-                self._join(first, second)
-        roots = np.array([self._root(number) for number in range(len(self._into))], dtype=np.intp)
-        return pd.factorize(roots)[0]
-
-    def _join(self, first: int, second: int) -> None:
-        if len(self._links[first]) < len(self._links[second]):
-            first, second = second, first
-        links = self._links
-        for instance, length in self._seen[second].items():
-            self._seen[first][instance] = self._seen[first].get(instance, 0.0) + length
-        self._seen[second] = {}
-        self._into[second] = first
-        del links[first][second]
-        for other, link in links[second].items():
-            if other != first:
-                del links[other][second]
-                before = links[first].get(other)
-                joined = link if before is None else _sum(before, link)
-                links[first][other] = links[other][first] = joined
-        links[second] = {}
-        for other, link in links[first].items():
-            cost = self._cost(first, other, link)
-            if cost < 1.0:
-                heapq.heappush(self._heap, (cost, min(first, other), max(first, other)))
-
-    def _root(self, number: int) -> int:
-        while self._into[number] != number:
-            number = self._into[number]
-        return number
+def _costs(links: Links, unit: float) -> Array:
+    """Return the mean square distance of groups as a share of the limit."""
+    limit = unit**2 * (links.metres + (REACH**2 - 1) * links.covisible)
+    return np.asarray(links.square / limit)
 
 
-def _sum(one: _Link, other: _Link) -> _Link:
-    return (one[0] + other[0], one[1] + other[1], one[2] + other[2], one[3] + other[3])
+def _apart(links: Links, seen: csr_array) -> NDArray[np.bool_]:
+    """Tell whether too many local maps saw both groups, side by side over much of what they saw."""
+    found = np.zeros(len(links.first), dtype=bool)
+    rows = np.flatnonzero(links.side_by_side > 0)
+    if len(rows) == 0:
+        return found
+    first, second = links.first[rows], links.second[rows]
+    both = seen[first].minimum(seen[second])
+    count, length = np.diff(both.indptr), np.maximum(both.sum(axis=1), np.finfo(float).tiny)
+    few = np.minimum(*(np.diff(seen.indptr)[end] for end in (first, second)))
+    found[rows] = np.minimum(1.0, links.side_by_side[rows] / length) * count > SIDE_BY_SIDE * few
+    return found
+
+
+def _mutually_nearest(links: Links, cost: Array, count: int) -> Index:
+    """Return the links between two groups each of which has no nearer one within the limit."""
+    rows = np.flatnonzero(cost < 1.0)
+    order = rows[np.lexsort((links.second[rows], links.first[rows], cost[rows]))]
+    rank, best = np.arange(len(order)), np.full(count, len(order))
+    for end in (links.first, links.second):
+        np.minimum.at(best, end[order], rank)
+    return order[(best[links.first[order]] == rank) & (best[links.second[order]] == rank)]
+
+
+def _joined(links: Links, new: Index) -> Links:
+    """Return the links between groups of new names, those between the same two added up."""
+    ends = np.sort(np.column_stack([new[links.first], new[links.second]]), axis=1)
+    width = int(new.max(initial=0)) + 1
+    key, place = np.unique(ends[:, 0] * width + ends[:, 1], return_inverse=True)
+    sums = (np.bincount(place, column, minlength=len(key)).astype(float) for column in links[2:])
+    joined = Links(key // width, key % width, *sums)
+    return joined.take(joined.first != joined.second)

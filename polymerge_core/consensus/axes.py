@@ -109,7 +109,8 @@ class Axes:
 
     def walked(self, points: Array, line: Index, station: Index) -> Index:
         """Return the stations to which one comes from given ones by going along each point's line ever nearer to it."""
-        station, x, y = station.copy(), *self.stations.T
+        station = station.copy()
+        x, y = self.stations[:, 0], self.stations[:, 1]
         low, last = self.first[line], self.counts[line] - 1
         ring = self.curves.closed[line]
 

@@ -97,7 +97,7 @@ def _tracks(state: State, drives: Instances) -> _Tracks:
     axes = state.fit.axes
     drive = np.zeros(len(axes.counts), np.intp)
     drive[state.group] = state.looks.instances.drive[state.looks.instance]
-    found = supported_stretches(axes, support(state.looks, state.group, axes, drive))
+    found = supported_stretches(axes, support(state.looks, state.group, state.fit, drive))
     track = stretch_of(found, np.arange(len(axes.line)))
     number = np.arange(len(axes.line)) - np.where(track >= 0, found.first[track], 0) if len(found.first) else track
     lines, line = shapes_of(axes.stations, found, 0.0), axes.line[found.first]
@@ -130,7 +130,7 @@ def _drawn(
 def _cut(tracks: _Tracks, joined: State) -> _Tracks:
     """Cut the tracks where too few drives saw the line that they are part of: there they may change over to another."""
     looks, axes = joined.looks, joined.fit.axes
-    found = supported_stretches(axes, support(looks, joined.group, axes))
+    found = supported_stretches(axes, support(looks, joined.group, joined.fit))
     piece = stretch_of(found, joined.fit.feet.station)
     begins = (np.diff(looks.owner, prepend=-1) != 0) | (np.diff(piece, prepend=-2) != 0)
     run = np.cumsum(begins) - 1

@@ -86,9 +86,7 @@ class Noise:
         return cls(np.full(len(looks.points), FIRST_NOISE * looks.unit))
 
 
-def fuse(
-    looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 2, near: Index | None = None
-) -> Fit:
+def fuse(looks: Looks, group: Index, axes: Axes, noise: Noise, *, rounds: int = 2, near: Index | None = None) -> Fit:
     """Fit lines to their looks.
 
     Parameters

@@ -104,7 +104,7 @@ def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tup
 def _finish(state: State) -> Lines:
     """Trim the lines to what is supported, and say where each point of the looks went."""
     looks, fit = state.looks, state.fit
-    found = support(looks, state.group, fit.axes)
+    found = support(looks, state.group, fit)
     stretches = supported_stretches(fit.axes, found)
     shapes = shapes_of(fit.axes.stations, stretches, _TOLERANCE * looks.unit)
     element = stretch_of(stretches, fit.feet.station)

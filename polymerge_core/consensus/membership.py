@@ -9,16 +9,21 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polymerge_core.consensus.alongside import ANGLE_DEG, REACH
 from polymerge_core.consensus.axes import Axes
+from polymerge_core.consensus.fusion import Fit
 from polymerge_core.consensus.looks import Looks, cross, dot
 from polymerge_core.curves import Array, Index, best_of_each, distinct
 
 #: Stations of lines that are looked at for each point.
 _NEAREST = 8
+
+#: Points whose neighbourhood is looked at as one, to see whether there is any other line.
+_PIECE = 16
 
 #: So many other looks say as much about a line as any more.
 _ENOUGH = 3
@@ -34,14 +39,30 @@ class Beside(NamedTuple):
     lateral: Array
 
 
-def points_beside(looks: Looks, axes: Axes) -> Beside:
-    """Find the lines that each point of the looks runs beside, within reach and in their direction."""
-    tree = cKDTree(axes.stations)
-    count = min(_NEAREST, len(axes.stations))
+def points_beside(looks: Looks, axes: Axes, own: Index | None = None) -> Beside:
+    """Find the lines that each point of the looks runs beside, within reach and in their direction.
+
+    Parameters
+    ----------
+    looks : Looks
+        Of one class.
+    axes : Axes
+        The lines.
+    own : ndarray of int, shape (p,), optional
+        The nearest station of the line that each point is part of: it saves looking for it where there is no other.
+    """
     far = (REACH + 0.5) * looks.unit
-    distance, station = tree.query(looks.points, k=np.arange(1, count + 1), distance_upper_bound=far)
+    crowded = np.arange(len(looks.points)) if own is None else _near_others(looks, axes, own, far)
+    tree = cKDTree(axes.stations)
+    nearest = np.arange(1, min(_NEAREST, len(axes.stations)) + 1)
+    distance, station = tree.query(looks.points[crowded], k=nearest, distance_upper_bound=far, workers=-1)
     point, rank = np.nonzero(np.isfinite(distance))
-    station = station[point, rank]
+    point, station = crowded[point], station[point, rank]
+    if own is not None:
+        others = np.ones(len(own), dtype=bool)
+        others[crowded] = False
+        alone = np.flatnonzero(others)
+        point, station = np.concatenate([point, alone]), np.concatenate([station, own[alone]])
     tangent = axes.tangent[station]
     offset = looks.points[point] - axes.stations[station]
     lateral, ahead = cross(tangent, offset), np.abs(dot(tangent, offset))
@@ -53,6 +74,27 @@ def points_beside(looks: Looks, axes: Axes) -> Beside:
     key = point[order] * (int(axes.line.max(initial=0)) + 1) + line[order]
     nearest = order[np.diff(key, prepend=-1) != 0]
     return Beside(point[nearest], station[nearest], line[nearest], lateral[nearest])
+
+
+def _near_others(looks: Looks, axes: Axes, own: Index, far: float) -> Index:
+    """Return the points that may be within reach of another line than their own."""
+    line = axes.line[own]
+    mine, _, first = _boxes(looks.points, looks.owner)
+    theirs, whose, _ = _boxes(axes.stations, axes.line)
+    piece, other = shapely.STRtree(theirs).query(mine, predicate="dwithin", distance=far)
+    near = np.zeros(len(mine), dtype=bool)
+    near[piece[line[first[piece]] != whose[other]]] = True
+    return np.flatnonzero(np.repeat(near, np.diff(np.append(first, len(line)))))
+
+
+def _boxes(points: Array, owner: Index) -> tuple[NDArray[np.object_], Index, Index]:
+    """Return boxes about every few points of each owner, whose they are, and the first point in each."""
+    number = np.arange(len(owner)) - np.searchsorted(owner, owner)
+    first = np.flatnonzero(number % _PIECE == 0)
+    if len(first) == 0:
+        return np.empty(0, dtype=object), first, first
+    corners = [reduce.reduceat(axis, first) for reduce in (np.minimum, np.maximum) for axis in points.T]
+    return shapely.box(*corners), owner[first], first
 
 
 def sightings(looks: Looks, group: Index, beside: Beside) -> tuple[Index, Index]:
@@ -84,17 +126,17 @@ def _limit(looks: Looks) -> float:
     return looks.unit * (REACH if looks.instances.footprint is not None else 1.0)
 
 
-def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
+def settle(looks: Looks, group: Index, fit: Fit, kind: Index) -> Index:
     """Give each look to the line that it agrees with over the greatest length.
 
     Parameters
     ----------
     looks : Looks
         Of one class.
-    axes : Axes
-        The lines.
     group : ndarray of int, shape (n,)
         The line of each look so far.
+    fit : Fit
+        These lines.
     kind : ndarray of int, shape (n,)
         A look stays among those of its kind.
 
@@ -103,7 +145,8 @@ def settle(looks: Looks, axes: Axes, group: Index, kind: Index) -> Index:
     ndarray of int, shape (n,)
         The line of each look.
     """
-    beside = points_beside(looks, axes)
+    axes = fit.axes
+    beside = points_beside(looks, axes, fit.feet.station)
     seen = np.bincount(sightings(looks, group, beside)[0], minlength=len(axes.line))
     owner = looks.owner[beside.point]
     own = beside.line == group[owner]

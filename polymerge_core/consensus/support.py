@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polymerge_core.consensus.axes import Axes, told_apart
+from polymerge_core.consensus.fusion import Fit
 from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.membership import points_beside, sightings
 from polymerge_core.curves import Array, Index, count_up, distinct
@@ -78,9 +79,10 @@ class Stretches(NamedTuple):
         return self.first[owner] + number, owner
 
 
-def support(looks: Looks, group: Index, axes: Axes, drive: Index | None = None) -> Support:
+def support(looks: Looks, group: Index, fit: Fit, drive: Index | None = None) -> Support:
     """Count who saw each station, and who should have; of `drive` alone, the drive of each line, where it is given."""
-    pairs = _sightings(looks, group, axes)
+    axes = fit.axes
+    pairs = _sightings(looks, group, fit)
     of_station = None if drive is None else drive[axes.line]
     found = judge(axes.stations, pairs, looks.instances, looks.unit, of_station)
     before = _before(looks, group, axes)
@@ -176,10 +178,11 @@ def _enough(seen: Index, expected: Array) -> NDArray[np.bool_]:
     return np.asarray(seen >= np.maximum(_CHANCE * np.sqrt(expected), _SHARE * expected))
 
 
-def _sightings(looks: Looks, group: Index, axes: Axes) -> Index:
+def _sightings(looks: Looks, group: Index, fit: Fit) -> Index:
     """Return ``station * number of local maps + local map`` of every sighting; rising."""
+    axes = fit.axes
     stations, instances = len(axes.line), len(looks.instances)
-    station, instance = sightings(looks, group, points_beside(looks, axes))
+    station, instance = sightings(looks, group, points_beside(looks, axes, fit.feet.station))
     found = np.sort(instance * stations + station)
     # Points are as far apart as stations, so that one falls between two of them now and then.
     skipped = found[:-1][np.diff(found) == 2] + 1

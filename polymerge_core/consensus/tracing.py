@@ -50,7 +50,7 @@ def trace(looks: Looks, kind: Index) -> State:
     group = _connected(looks, pairs, associate(looks, pairs))
     state = _begin(looks, pairs, group, Noise.unknown(looks))
     for _ in range(_ROUNDS):
-        group = _connected(looks, pairs, settle(looks, state.fit.axes, state.group, kind))
+        group = _connected(looks, pairs, settle(looks, state.group, state.fit, kind))
         if np.array_equal(group, state.group):
             break
         state = _begin(looks, pairs, group, Noise(state.fit.sigma, state.fit.drive_sigma))
@@ -66,7 +66,9 @@ def moved(state: State, step: Array, centre: Array) -> State:
     """Move the local maps, and fit the lines anew."""
     looks = corrected(state.looks, step, centre)
     noise = Noise(state.fit.sigma, state.fit.drive_sigma)
-    return State(looks, state.group, fuse(looks, state.group, state.fit.axes, noise, rounds=1, near=state.fit.feet.station))
+    return State(
+        looks, state.group, fuse(looks, state.group, state.fit.axes, noise, rounds=1, near=state.fit.feet.station)
+    )
 
 
 def _connected(looks: Looks, pairs: Pairs, group: Index) -> Index:
