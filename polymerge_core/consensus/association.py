@@ -23,6 +23,7 @@ from polymerge_core.curves import Array, Index
 #: only drew one twice, or invented one beside it. A local map that saw them so over half their length counts half.
 SIDE_BY_SIDE = 0.4
 
+
 def associate(looks: Looks, pairs: Pairs) -> Index:
     """Group looks at the same line.
 
@@ -92,7 +93,6 @@ def link_groups(instance: Index, size: Array, links: Links, unit: float) -> Inde
     """
     group = np.arange(len(instance))
     seen = csr_array((size, (group, instance)), shape=(len(group), int(instance.max(initial=0)) + 1))
-    links = links.take(links.metres > 0)
     while True:
         # What is too far apart with all that it has links with stays so: a mean lies between what it is the mean of.
         cost = _costs(links, unit)
@@ -112,9 +112,9 @@ def link_groups(instance: Index, size: Array, links: Links, unit: float) -> Inde
 
 
 def _costs(links: Links, unit: float) -> Array:
-    """Return the mean square distance of groups as a share of the limit."""
+    """Return the mean square distance of groups as a share of the limit; infinite where there is none."""
     limit = unit**2 * (links.metres + (REACH**2 - 1) * links.covisible)
-    return np.asarray(links.square / limit)
+    return np.where(limit > 0, links.square / np.maximum(limit, np.finfo(float).tiny), np.inf)
 
 
 def _apart(links: Links, seen: csr_array) -> NDArray[np.bool_]:
