@@ -160,6 +160,14 @@ def distinct(values: Index) -> Index:
     return ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
 
 
+def among(values: Index, ordered: Index) -> NDArray[np.bool_]:
+    """Return which values are among others that rise: `numpy.isin`, without sorting these again."""
+    if len(ordered) == 0:
+        return np.zeros(len(values), dtype=bool)
+    place = np.searchsorted(ordered, values)
+    return np.asarray(ordered[np.minimum(place, len(ordered) - 1)] == values)
+
+
 def best_of_each(owner: Index, score: NDArray[Any], tie: NDArray[Any]) -> Index:
     """Return the row of each owner with the highest score, of equal ones (to 1e-9) that with the least `tie`."""
     order = np.lexsort((tie, -np.round(score, 9), owner))

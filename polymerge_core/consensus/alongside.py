@@ -5,7 +5,6 @@ Alongside is more than near: two lines that touch end to end, cross or fork are 
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -78,8 +77,7 @@ def pairs_alongside(looks: Looks, kind: Index) -> Pairs:
     # The looks as lines of their points, which lie as close together as stations do.
     drawn = Axes(looks.points, looks.owner)
     blocks = np.array_split(np.arange(len(short)), max(1, len(short) // _BLOCK))
-    with ThreadPoolExecutor() as threads:
-        parts = list(threads.map(lambda rows: _measured(looks, drawn, short[rows], long[rows]), blocks))
+    parts = [_measured(looks, drawn, short[rows], long[rows]) for rows in blocks]
     return Pairs._make(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
@@ -151,7 +149,7 @@ def _beginning(drawn: Axes, points: Array, line: Index, number: Index) -> Index:
     distance = ((drawn.stations[station] - points[rows][some]) ** 2).sum(axis=1)
     found[rows] = station[best_of_each(some, -distance, station)]
     while len(rows):
-        found[rows] = drawn.walked(points[rows], line[rows], found[rows])
+        found[rows] = drawn.walked(points[rows], found[rows])
         after = rows[rows + 1 < len(number)] + 1
         after = after[number[after] > 0]
         found[after] = found[after - 1]

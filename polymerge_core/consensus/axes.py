@@ -107,25 +107,20 @@ class Axes:
         _, station = self._tree.query(told_apart(points, line), workers=-1)
         return np.asarray(station, dtype=np.intp)
 
-    def walked(self, points: Array, line: Index, station: Index) -> Index:
-        """Return the stations to which one comes from given ones by going along each point's line ever nearer to it."""
+    def walked(self, points: Array, station: Index) -> Index:
+        """Return the stations to which one comes from given ones by going along the line ever nearer to each point."""
         station = station.copy()
         x, y = self.stations[:, 0], self.stations[:, 1]
-        low, last = self.first[line], self.counts[line] - 1
-        ring = self.curves.closed[line]
 
         def distance(rows: Index, there: Index) -> Array:
             return np.asarray((x[there] - points[rows, 0]) ** 2 + (y[there] - points[rows, 1]) ** 2)
 
         every = np.arange(len(points))
         nearest = distance(every, station)
-        for step in (1, -1):
+        for neighbour in self._neighbours:
             rows = every
             while len(rows):
-                number = station[rows] - low[rows] + step
-                # A ring goes on past its last station, which is its first.
-                number = np.where(ring[rows], number % last[rows], np.clip(number, 0, last[rows]))
-                there = low[rows] + number
+                there = neighbour[station[rows]]
                 far = distance(rows, there)
                 nearer = far < nearest[rows]
                 rows, there = rows[nearer], there[nearer]
@@ -146,30 +141,45 @@ class Axes:
         near : ndarray of int, shape (p,), optional
             A station of the line of each that is near it, where that is known already.
         """
-        station = self.nearest(points, line) if near is None else self.walked(points, line, near)
-        before = np.maximum(station - 1, self.first[line])
-        after = np.minimum(station + 1, self.first[line] + self.counts[line] - 1)
-        ring = self.curves.closed[line]
-        last = self.counts[line] - 1
-        before = np.where(ring & (station == self.first[line]), self.first[line] + last - 1, before)
-        after = np.where(ring & (station == self.first[line] + last), self.first[line] + 1, after)
-        offset = points - self.stations[station]
-        tangent = self.tangent[station]
+        station = self.nearest(points, line) if near is None else self.walked(points, near)
+        offset, tangent = points - self.stations[station], self.tangent[station]
         ahead = dot(tangent, offset)
-        neighbour = np.where((ahead >= 0)[:, None], self.stations[after], self.stations[before])
-        chord = neighbour - self.stations[station]
-        square = dot(chord, chord)
+        # Along the chord to the next station or to the one before, whichever way the point lies.
+        way = station + np.where(ahead >= 0, 0, len(self.stations))
+        chord, square = self._chords
+        chord, square = chord[way], square[way]
         share = np.clip(dot(chord, offset) / np.maximum(square, np.finfo(float).tiny), 0.0, 1.0)
-        rest = offset - share[:, None] * chord
+        lateral = cross(tangent, offset) - share * cross(tangent, chord)
         beside = (square > 0) | (np.abs(ahead) <= 0.5 * unit)
-        lateral = cross(tangent, rest)
-        return Feet(self.alone(station), lateral, tangent, ahead, beside)
+        return Feet(self._alone[station], lateral, tangent, ahead, beside)
+
+    @cached_property
+    def _neighbours(self) -> tuple[Index, Index]:
+        """The station after each and the one before it; a ring goes on past its end, and an open line does not."""
+        every, last = np.arange(len(self.line)), self.first + self.counts - 1
+        after = np.minimum(every + 1, last[self.line])
+        before = np.maximum(every - 1, self.first[self.line])
+        ring = self.curves.closed
+        # The last station of a ring is its first one.
+        after[last[ring]], before[self.first[ring]] = self.first[ring] + 1, last[ring] - 1
+        return after, before
+
+    @cached_property
+    def _chords(self) -> tuple[Array, Array]:
+        """The way from each station to the one after it, then from each to the one before, and the squared lengths."""
+        chord = np.concatenate([self.stations[neighbour] - self.stations for neighbour in self._neighbours])
+        return chord, dot(chord, chord)
+
+    @cached_property
+    def _alone(self) -> Index:
+        station = np.arange(len(self.line))
+        ring = self.curves.closed
+        station[(self.first + self.counts - 1)[ring]] = self.first[ring]
+        return station
 
     def alone(self, station: Index) -> Index:
         """Return stations with the last one of a ring called by its first, which is the same."""
-        line = self.line[station]
-        last = self.curves.closed[line] & (station == self.first[line] + self.counts[line] - 1)
-        return np.where(last, self.first[line], station)
+        return self._alone[station]
 
     def around(self, values: Any) -> Any:
         """Return values of stations with that of the first station of a ring given to its last, which is the same."""

@@ -17,7 +17,7 @@ from polymerge_core.consensus.alongside import ANGLE_DEG, REACH
 from polymerge_core.consensus.axes import Axes
 from polymerge_core.consensus.fusion import Fit
 from polymerge_core.consensus.looks import Looks, cross, dot
-from polymerge_core.curves import Array, Index, best_of_each, distinct
+from polymerge_core.curves import Array, Index, among, best_of_each, distinct
 
 #: Stations of lines that are looked at for each point.
 _NEAREST = 8
@@ -181,7 +181,5 @@ def _taken(looks: Looks, beside: Beside, own: NDArray[np.bool_]) -> NDArray[np.b
     there = distinct(place[own])
     # Points are as far apart as stations, so that a neighbour may be the one that the other look has.
     for shift in (-step, 0, step):
-        wanted = place[foreign] + shift
-        at = np.minimum(np.searchsorted(there, wanted), len(there) - 1)
-        found[foreign] |= there[at] == wanted
+        found[foreign] |= among(place[foreign] + shift, there)
     return found

@@ -19,7 +19,7 @@ from polymerge_core.consensus.axes import Axes, told_apart
 from polymerge_core.consensus.fusion import Fit
 from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.membership import points_beside, sightings
-from polymerge_core.curves import Array, Index, count_up, distinct
+from polymerge_core.curves import Array, Index, among, count_up, distinct
 
 #: What is seen as often as expected is seen so by chance now and then: fewer than this times the square root of what is
 #: expected is too few ...
@@ -131,14 +131,14 @@ def judge(places: Array, pairs: Index, instances: Instances, unit: float, drive:
     if drive is not None:
         own = instances.drive[instance] == drive[place]
         instance, place = instance[own], place[own]
-    saw = np.isin(place * count + instance, pairs)
+    saw = among(place * count + instance, pairs)
     chance = _chances(places[place], instances, instance, saw, (seen >= SURE)[place], _SQUARE * unit)
     expected = np.bincount(place, chance, minlength=len(places)).astype(float)
     # A drive should have seen what one of its local maps at least should have.
     passed, inverse = np.unique(place * drives + instances.drive[instance], return_inverse=True)
     passed = passed[np.bincount(inverse, chance) >= 1.0]
     sure = (seen_drives >= SURE)[passed // drives]
-    share = np.isin(passed, seen_by)[sure].mean() if sure.any() else 1.0
+    share = among(passed, seen_by)[sure].mean() if sure.any() else 1.0
     passes = np.bincount(passed // drives, minlength=len(places)).astype(np.float64)
     return Support(seen, expected, seen_drives, share * passes)
 
