@@ -96,6 +96,12 @@ def _instance_rank(parts: pd.DataFrame) -> NDArray[np.intp]:
         # Features that are a local map each: the same keys as below, without a loop over all of them.
         keyed = parts[["timestamp_ns", "key", "content"]].assign(local=~parts["is_main"], start=drive_start)
         return keyed.groupby(["local", "start", "timestamp_ns", "key", "content"]).ngroup().to_numpy()
+    if (instances["kind"] == "column").all():
+        ranked = instances.assign(is_main=~instances["is_main"].astype(bool))
+        for name in ("drive", "instance"):
+            ranked[name] = natural_rank(instances[name])
+        keyed = ranked.groupby(["is_main", "drive_start", "drive", "time", "instance"], dropna=False)
+        return keyed.ngroup().to_numpy()[group]
     # The normalised WKB of all observations first; where it is the same, class, direction and columns.
     content = zip(_sorted_by(group, parts["key"]), _sorted_by(group, parts["content"]), strict=True)
     keys: list[tuple[Any, ...]] = []
@@ -107,6 +113,20 @@ def _instance_rank(parts: pd.DataFrame) -> NDArray[np.intp]:
     ranks = {key: rank for rank, key in enumerate(sorted(set(keys)))}
     rank = np.array([ranks[key] for key in keys], dtype=np.intp)
     return rank[group] if len(rank) else np.empty(0, np.intp)
+
+
+def natural_rank(texts: pd.Series[str]) -> NDArray[np.intp]:
+    """Rank texts as `natural_key` orders them."""
+    codes, names = pd.factorize(texts)
+    if all(map(str.isdecimal, names)):
+        bare = [name.lstrip("0") for name in names]
+        size = np.array([len(name) for name in bare], dtype=np.intp)
+        order = np.lexsort((np.array(names, dtype=str), np.array(bare, dtype=str), size))
+    else:
+        order = np.array(sorted(range(len(names)), key=lambda number: natural_key(names[number])), dtype=np.intp)
+    rank = np.empty(len(names), np.intp)
+    rank[order] = np.arange(len(names))
+    return rank[codes]
 
 
 def _sorted_by(group: NDArray[np.intp], values: pd.Series[int]) -> list[tuple[int, ...]]:

@@ -52,28 +52,33 @@ def points_beside(looks: Looks, axes: Axes, own: Index | None = None) -> Beside:
         The nearest station of the line that each point is part of: it saves looking for it where there is no other.
     """
     far = (REACH + 0.5) * looks.unit
-    crowded = np.arange(len(looks.points)) if own is None else _near_others(looks, axes, own, far)
+    every = np.arange(len(looks.points))
+    crowded = every if own is None else _near_others(looks, axes, own, far)
     tree = cKDTree(axes.stations)
     nearest = np.arange(1, min(_NEAREST, len(axes.stations)) + 1)
     distance, station = tree.query(looks.points[crowded], k=nearest, distance_upper_bound=far, workers=-1)
     point, rank = np.nonzero(np.isfinite(distance))
-    point, station = crowded[point], station[point, rank]
-    if own is not None:
-        others = np.ones(len(own), dtype=bool)
-        others[crowded] = False
-        alone = np.flatnonzero(others)
-        point, station = np.concatenate([point, alone]), np.concatenate([station, own[alone]])
+    found, ahead = _beside(looks, axes, crowded[point], station[point, rank])
+    # Of the stations of one line the one that the point lies beside.
+    key = found.point * len(axes.counts) + found.line
+    one = best_of_each(key, -ahead, found.station)
+    found = Beside._make(column[one] for column in found)
+    if own is None:
+        return found
+    alone = np.delete(every, crowded)
+    lone, _ = _beside(looks, axes, alone, own[alone])
+    return Beside._make(np.concatenate(columns) for columns in zip(found, lone, strict=True))
+
+
+def _beside(looks: Looks, axes: Axes, point: Index, station: Index) -> tuple[Beside, Array]:
+    """Return the points that lie beside stations, and how far before or behind them, metres."""
     tangent = axes.tangent[station]
     offset = looks.points[point] - axes.stations[station]
     lateral, ahead = cross(tangent, offset), np.abs(dot(tangent, offset))
     straight = np.abs(dot(tangent, looks.tangent[point])) > np.cos(np.radians(ANGLE_DEG))
     kept = straight & (np.abs(lateral) <= REACH * looks.unit) & (ahead <= 0.75 * looks.unit)
-    point, station, lateral, ahead = point[kept], axes.alone(station[kept]), lateral[kept], ahead[kept]
-    line = axes.line[station]
-    order = np.lexsort((ahead, line, point))
-    key = point[order] * (int(axes.line.max(initial=0)) + 1) + line[order]
-    nearest = order[np.diff(key, prepend=-1) != 0]
-    return Beside(point[nearest], station[nearest], line[nearest], lateral[nearest])
+    station = axes.alone(station[kept])
+    return Beside(point[kept], station, axes.line[station], lateral[kept]), ahead[kept]
 
 
 def _near_others(looks: Looks, axes: Axes, own: Index, far: float) -> Index:

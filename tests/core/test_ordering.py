@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import LineString, Polygon
 
-from polymerge_core.ordering import canonical_order, natural_key
+from polymerge_core.ordering import canonical_order, natural_key, natural_rank
 
 NO_TIMESTAMP = np.iinfo(np.int64).max
 
@@ -83,6 +83,14 @@ class TestNaturalKey:
         keys = [natural_key(text) for text in texts]
         assert len(set(keys)) == len(texts)
         sorted(keys)  # any two can be compared
+
+    @given(st.lists(st.text("0123456789\N{ARABIC-INDIC DIGIT THREE}a", max_size=4)))
+    def test_ranks_many_texts(self, texts):
+        names = sorted(set(texts), key=natural_key)
+        assert natural_rank(pd.Series(texts, dtype=object)).tolist() == [names.index(text) for text in texts]
+
+    def test_ranks_many_numbers(self):
+        assert natural_rank(pd.Series(["10", "007", "9", "7", "10"])).tolist() == [3, 0, 2, 1, 3]
 
 
 class TestInstances:
