@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polymerge_core.consensus.axes import Axes
 from polymerge_core.consensus.looks import Looks, dot
-from polymerge_core.curves import Array, Index, best_of_each, count_up
+from polymerge_core.curves import Array, Index, best_of_each, count_up, distinct
 
 #: Looks farther apart than this many proximities are never compared.
 REACH = 2.5
@@ -29,6 +29,12 @@ _COARSE = 8
 
 #: Pairs that are measured at a time, so that what is worked out on the way stays small.
 _BLOCK = 20_000
+
+#: Looks whose neighbours are listed at a time, for the same reason.
+_LOOKS = 2_000
+
+#: Where more looks than this come near one, so many of them tell as much about it as all would.
+_PARTNERS = 64
 
 
 class Pairs(NamedTuple):
@@ -87,13 +93,34 @@ def _near(looks: Looks, kind: Index) -> tuple[Index, Index]:
     west, south, east, north = shapely.bounds(lines).T
     # Boxes of two kinds are told apart by where they are.
     beyond = kind * (np.ptp([west, east]) + 2 * distance) if len(lines) else west
-    tree = shapely.STRtree(shapely.box(west + beyond, south, east + beyond, north))
+    boxes = shapely.box(west + beyond, south, east + beyond, north)
     around = shapely.box(west + beyond - distance, south - distance, east + beyond + distance, north + distance)
-    first, second = tree.query(around)
-    once = first < second
-    first, second = first[once], second[once]
+    tree, blocks = shapely.STRtree(boxes), np.array_split(np.arange(len(lines)), 1 + len(lines) // _LOOKS)
+    some = [_some(looks, rows, tree.query(around[rows])) for rows in blocks]
+    pairs = distinct(np.concatenate(some))
+    first, second = pairs // max(len(lines), 1), pairs % max(len(lines), 1)
     near = shapely.dwithin(lines[first], lines[second], distance)
     return first[near], second[near]
+
+
+def _some(looks: Looks, rows: Index, neighbours: Index) -> Index:
+    """Choose the pairs of some looks that are looked at, ``first * number of looks + second``."""
+    row, other = neighbours
+    mine = rows[row]
+    partners = np.bincount(row, minlength=len(rows))[row]
+    first, second = np.minimum(mine, other), np.maximum(mine, other)
+    # What one local map saw side by side tells lines apart: of that there is little, and all of it counts.
+    kept = (looks.instance[mine] == looks.instance[other]) | (_drawn_lot(first, second) * partners < _PARTNERS)
+    kept &= first < second
+    return first[kept] * len(looks) + second[kept]
+
+
+def _drawn_lot(first: Index, second: Index) -> Array:
+    """Return a number from 0 to 1 for each pair that is as good as random, and always the same (splitmix64)."""
+    mixed = first.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + second.astype(np.uint64)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
+    return (mixed ^ (mixed >> np.uint64(31))) / 2.0**64
 
 
 def _measured(looks: Looks, drawn: Axes, short: Index, long: Index) -> Pairs:

@@ -102,11 +102,10 @@ def _senses(count: int, pairs: Pairs) -> Array:
     hung = np.where(depth[first] > depth[second], first, second)
     parent, of_parent = np.arange(count), np.ones(count)
     parent[hung], of_parent[hung] = first + second - hung, sense
-    found = np.ones(count)
-    for level in range(1, int(depth.max(initial=0)) + 1):
-        rows = np.flatnonzero(depth == level)
-        found[rows] = found[parent[rows]] * of_parent[rows]
-    return found
+    # Each look takes its parent's way round, then its parent's parent's, and so on, in steps twice as long each time.
+    while not np.array_equal(parent, grandparent := parent[parent]):
+        of_parent, parent = of_parent * of_parent[parent], grandparent
+    return of_parent
 
 
 def _beginnings(count: int, pairs: Pairs, sense: Array) -> Array:

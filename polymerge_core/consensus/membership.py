@@ -84,22 +84,22 @@ def _beside(looks: Looks, axes: Axes, point: Index, station: Index) -> tuple[Bes
 def _near_others(looks: Looks, axes: Axes, own: Index, far: float) -> Index:
     """Return the points that may be within reach of another line than their own."""
     line = axes.line[own]
-    mine, _, first = _boxes(looks.points, looks.owner)
-    theirs, whose, _ = _boxes(axes.stations, axes.line)
-    piece, other = shapely.STRtree(theirs).query(mine, predicate="dwithin", distance=far)
+    mine, _, first = _boxes(looks.points, looks.owner, far)
+    theirs, whose, _ = _boxes(axes.stations, axes.line, 0.0)
+    piece, other = shapely.STRtree(theirs).query(mine)
     near = np.zeros(len(mine), dtype=bool)
     near[piece[line[first[piece]] != whose[other]]] = True
     return np.flatnonzero(np.repeat(near, np.diff(np.append(first, len(line)))))
 
 
-def _boxes(points: Array, owner: Index) -> tuple[NDArray[np.object_], Index, Index]:
-    """Return boxes about every few points of each owner, whose they are, and the first point in each."""
+def _boxes(points: Array, owner: Index, margin: float) -> tuple[NDArray[np.object_], Index, Index]:
+    """Return boxes with a margin about every few points of each owner, whose they are, and the first point in each."""
     number = np.arange(len(owner)) - np.searchsorted(owner, owner)
     first = np.flatnonzero(number % _PIECE == 0)
     if len(first) == 0:
         return np.empty(0, dtype=object), first, first
-    corners = [reduce.reduceat(axis, first) for reduce in (np.minimum, np.maximum) for axis in points.T]
-    return shapely.box(*corners), owner[first], first
+    low, high = np.minimum.reduceat(points, first) - margin, np.maximum.reduceat(points, first) + margin
+    return shapely.box(*low.T, *high.T), owner[first], first
 
 
 def sightings(looks: Looks, group: Index, beside: Beside) -> tuple[Index, Index]:
