@@ -110,21 +110,20 @@ class Axes:
     def walked(self, points: Array, station: Index) -> Index:
         """Return the stations to which one comes from given ones by going along the line ever nearer to each point."""
         station = station.copy()
-        x, y = self.stations[:, 0], self.stations[:, 1]
-
-        def distance(rows: Index, there: Index) -> Array:
-            return np.asarray((x[there] - points[rows, 0]) ** 2 + (y[there] - points[rows, 1]) ** 2)
-
-        every = np.arange(len(points))
-        nearest = distance(every, station)
+        x, y = self._columns
+        east, north = np.ascontiguousarray(points.T)
+        nearest = (x[station] - east) ** 2 + (y[station] - north) ** 2
         for neighbour in self._neighbours:
-            rows = every
+            there = neighbour[station]
+            far = (x[there] - east) ** 2 + (y[there] - north) ** 2
+            rows = np.flatnonzero(far < nearest)
+            there, far = there[rows], far[rows]
             while len(rows):
-                there = neighbour[station[rows]]
-                far = distance(rows, there)
+                station[rows], nearest[rows] = there, far
+                there = neighbour[there]
+                far = (x[there] - east[rows]) ** 2 + (y[there] - north[rows]) ** 2
                 nearer = far < nearest[rows]
-                rows, there = rows[nearer], there[nearer]
-                station[rows], nearest[rows] = there, far[nearer]
+                rows, there, far = rows[nearer], there[nearer], far[nearer]
         return station
 
     def feet(self, points: Array, line: Index, unit: float, near: Index | None = None) -> Feet:
@@ -152,6 +151,11 @@ class Axes:
         lateral = cross(tangent, offset) - share * cross(tangent, chord)
         beside = (square > 0) | (np.abs(ahead) <= 0.5 * unit)
         return Feet(self._alone[station], lateral, tangent, ahead, beside)
+
+    @cached_property
+    def _columns(self) -> Array:
+        """The stations' coordinates, each in one piece, which is read much faster."""
+        return np.ascontiguousarray(self.stations.T)
 
     @cached_property
     def _neighbours(self) -> tuple[Index, Index]:
