@@ -18,6 +18,7 @@ from polymerge_core.consensus.drift import Drift, no_drift
 from polymerge_core.consensus.drives import join_drives
 from polymerge_core.consensus.known import KnownLines, known_lines
 from polymerge_core.consensus.looks import Looks
+from polymerge_core.consensus.meetings import met
 from polymerge_core.consensus.registration import centres, corrections, equations
 from polymerge_core.consensus.support import means, shapes_of, stretch_of, support, supported_stretches
 from polymerge_core.consensus.tracing import State, moved, trace
@@ -98,7 +99,16 @@ def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tup
         states = [moved(state, step, centre) for state in states]
         corrected += step
         advance(0.6 + 0.35 * (number + 1) / _CORRECTIONS)
-    return [_finish(state) for state in states], shifted + corrected, drift
+    return _meeting(states, [_finish(state) for state in states]), shifted + corrected, drift
+
+
+def _meeting(states: list[State], lines: list[Lines]) -> list[Lines]:
+    """Draw the lines of all classes to what they meet."""
+    first = np.cumsum([0, *(len(each.shapes) for each in lines)])
+    element = [np.where(each.element >= 0, each.element + start, -1) for each, start in zip(lines, first, strict=False)]
+    shapes = met(np.concatenate([each.shapes for each in lines]), [state.looks for state in states], element)
+    parts = np.split(shapes, first[1:-1])
+    return [each._replace(shapes=part) for each, part in zip(lines, parts, strict=True)]
 
 
 def _finish(state: State) -> Lines:
