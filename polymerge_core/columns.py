@@ -119,7 +119,7 @@ def _features(layer: Layer, options: Options, *, several: bool, notes: dict[str,
     _read_instance(find, layer, options, table, several=several, notes=notes)
     _read_score(find, options, table)
     table["timestamp_ns"] = _read_timestamp(find("timestamp", options.timestamp_field), layer.where)
-    sigma = find("sigma", None)
+    sigma = find("sigma_m" if layer.is_main else "sigma", None)
     table["sigma"] = np.nan if sigma is None else pd.to_numeric(sigma, errors="coerce").to_numpy(dtype=float)
     _read_main(find, layer, table)
     return table, find.used

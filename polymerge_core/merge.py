@@ -50,7 +50,8 @@ class MergeResult:
     left_out : DataFrame
         What is in no element, with a reason. With `lineage` it covers each observation exactly once.
     id_aliases : DataFrame
-        Ids of main-map elements that became part of another one: `old_id`, `element_id`.
+        Ids of main-map elements that became part of another one: `old_id`, `element_id`; -1 where all of the element is
+        left out.
     report : dict
         Counts, options, CRSs and warnings; ready for JSON.
     """

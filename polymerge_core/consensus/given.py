@@ -12,9 +12,12 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
+from polymerge_core.consensus.alongside import REACH
 from polymerge_core.consensus.areas import Areas, merge_looks_at_areas
+from polymerge_core.consensus.drift import Drift
 from polymerge_core.consensus.known import KnownAreas
 from polymerge_core.consensus.looks import Instances, Looks
+from polymerge_core.consensus.main_map import remembered
 from polymerge_core.consensus.registration import centres, moved_by
 from polymerge_core.crs import transform_coordinates
 from polymerge_core.curves import Array, Index
@@ -55,25 +58,42 @@ class Given:
     lines: list[tuple[str, Index]]
     areas: list[tuple[str, Index]]
     unit: float
+    past: Array
 
     def looks_of(self, rows: Index) -> Looks:
         """Return the looks of one class of lines."""
         shapes = self.table["shape"].to_numpy(dtype=object)
-        return Looks.of(shapes[rows], self.instance[rows], self.weight[rows], self.instances, self.unit)
+        looks = Looks.of(shapes[rows], self.instance[rows], self.weight[rows], self.instances, self.unit)
+        return looks.remembering(self.past[rows][looks.owner])
 
-    def followed(self, looks: list[Looks], corrections: Array) -> NDArray[np.object_]:
+    def followed(self, looks: list[Looks], corrections: Array, drift: Drift) -> NDArray[np.object_]:
         """Return the shapes of all observations, areas moved as the lines say that their local maps were off."""
         shapes = self.table["shape"].to_numpy(dtype=object, copy=True)
         rows = np.concatenate([rows for _, rows in self.areas]) if self.areas else np.empty(0, np.intp)
         if looks and len(rows):
             centre = centres(looks, len(self.instances))
-            shapes[rows] = moved_by(shapes[rows], self.instance[rows], corrections, centre)
+            known = self._known(rows)
+            new, old = rows[~known], rows[known]
+            shapes[new] = moved_by(shapes[new], self.instance[new], corrections, centre)
+            shapes[old] = drift.followed(shapes[old], self.instances.drive[self.instance[old]])
         return shapes
 
     def merge_areas(self, shapes: NDArray[np.object_], rows: Index, before: KnownAreas | None = None) -> Areas:
-        """Merge one class of areas, given the shapes of all observations."""
-        chosen = (shapes[rows], self.instance[rows], self.weight[rows])
-        return merge_looks_at_areas(*chosen, self.instances, self.unit, before)
+        """Merge one class of areas, given the shapes of all observations and, without a main map, what was known."""
+        known = self._known(rows)
+        new, old = rows[~known], rows[known]
+        if len(old):
+            before = KnownAreas(shapes[old], self.weight[old], np.ones(len(old), bool), self.past[old, 1:])
+        areas = merge_looks_at_areas(
+            shapes[new], self.instance[new], self.weight[new], self.instances, self.unit, before
+        )
+        element = np.empty(len(rows), np.intp)
+        element[np.argsort(known, kind="stable")] = areas.element[: len(rows)]
+        return areas._replace(element=element)
+
+    def _known(self, rows: Index) -> NDArray[np.bool_]:
+        """Tell elements of the main map from new observations."""
+        return np.asarray(self.instance[rows] == self.instances.known)
 
 
 def read_looks(observations: Observations, local_maps: Sequence[LocalMaps], options: Options) -> Given:
@@ -101,11 +121,28 @@ def read_looks(observations: Observations, local_maps: Sequence[LocalMaps], opti
             f"more than the {MOST_POINTS / 1e6:.0f} million that memory is sure to hold; choose a larger proximity, or "
             "merge the data in parts"
         )
-    instances, instance = read_instances(table, local_maps, observations.crs)
+    instances, instance = _with_main_map(table, local_maps, observations.crs, options.proximity)
     weight = table["weight"].to_numpy(dtype=float) * np.maximum(table["score"].to_numpy(dtype=float), _LEAST_WEIGHT)
     is_area = table["is_area"].to_numpy(dtype=bool)
     lines, areas = (_by_class(table, np.flatnonzero(kind)) for kind in (~is_area, is_area))
-    return Given(table, instances, instance, weight, lines, areas, options.proximity)
+    past = remembered(table, instance, instances.drive, options.proximity)
+    return Given(table, instances, instance, weight, lines, areas, options.proximity, past)
+
+
+def _with_main_map(
+    table: pd.DataFrame, local_maps: Sequence[LocalMaps], crs: pyproj.CRS, unit: float
+) -> tuple[Instances, Index]:
+    """Return the local maps, the main map as what was known before, and which of them each observation is of."""
+    main = table["is_main"].to_numpy(dtype=bool)
+    instances, codes = read_instances(table[~main], local_maps, crs)
+    if not main.any():
+        return instances, codes
+    # A map covers the place that it is of: who looks there and sees what it does not show, sees something else.
+    bounds = shapely.total_bounds(table["shape"].to_numpy(dtype=object)[main])
+    instances = instances.with_known(shapely.buffer(shapely.box(*bounds), REACH * unit, join_style="mitre"))
+    instance = np.full(len(table), instances.known)
+    instance[~main] = codes
+    return instances, instance
 
 
 def _by_class(table: pd.DataFrame, rows: Index) -> list[tuple[str, Index]]:
