@@ -33,7 +33,7 @@ from polymerge_core.schema import (
     LINEAGE_TABLE,
     LocalMaps,
 )
-from polymerge_core.sets import ElementSets, Input, Progress, as_local_maps, find_network, order_sets
+from polymerge_core.sets import ElementSets, Input, Progress, as_local_maps, find_network, note_layers_apart, order_sets
 
 
 @dataclass(frozen=True)
@@ -214,6 +214,7 @@ def _merge_by_consensus(local_maps: Input, main_map: Input | None, options: Opti
     main: list[LocalMaps] = [] if main_map is None else as_local_maps(main_map, "main_map")
     layers = as_local_maps(local_maps, "local_maps")
     observations = observe(layers, main, options)
+    note_layers_apart(observations, options)
     merged = merge_by_consensus(
         observations, layers, options, lambda share: progress(0.1 + 0.85 * share, "finding the consensus")
     )

@@ -355,9 +355,25 @@ def _note_like_degrees(table: pd.DataFrame, notes: dict[str, Any]) -> None:
 
 
 def _left_out(parts: pd.DataFrame, local_maps: list[LocalMaps]) -> pd.DataFrame:
-    """List what was left out here and before, in canonical order."""
+    """List what was left out here and before."""
     earlier = [maps.left_out for maps in local_maps if maps.left_out is not None and len(maps.left_out)]
-    listed = pd.concat([parts[list(LEFT_OUT_COLUMNS)], *(table[list(LEFT_OUT_COLUMNS)] for table in earlier)])
+    return list_left_out([parts, *earlier])
+
+
+def list_left_out(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """List what was left out, in canonical order.
+
+    Parameters
+    ----------
+    tables : sequence of DataFrame
+        Each with `LEFT_OUT_COLUMNS`, and maybe more.
+
+    Returns
+    -------
+    DataFrame
+        `LEFT_OUT_COLUMNS` of all.
+    """
+    listed = pd.concat([table[list(LEFT_OUT_COLUMNS)] for table in tables])
     listed["instance"] = listed["instance"].astype(str)
     keys = ["source", "drive", "instance", "reason", "from_m", "to_m", "source_fid"]
     text = listed["source_fid"].astype(str)

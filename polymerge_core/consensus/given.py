@@ -5,21 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import geopandas as gpd
 import numpy as np
 import pandas as pd
-import pyproj
-import shapely
 from numpy.typing import NDArray
 
-from polymerge_core.consensus.alongside import REACH
 from polymerge_core.consensus.areas import Areas, merge_looks_at_areas
 from polymerge_core.consensus.drift import Drift
+from polymerge_core.consensus.instances import read_instances
 from polymerge_core.consensus.known import KnownAreas
 from polymerge_core.consensus.looks import Instances, Looks
 from polymerge_core.consensus.main_map import remembered
 from polymerge_core.consensus.registration import centres, moved_by
-from polymerge_core.crs import transform_coordinates
 from polymerge_core.curves import Array, Index
 from polymerge_core.errors import InputError
 from polymerge_core.observations import Observations
@@ -112,6 +108,8 @@ def read_looks(observations: Observations, local_maps: Sequence[LocalMaps], opti
     ------
     InputError
         If the proximity is too small for so much length.
+    SchemaError
+        If it cannot be told which local map a footprint is of.
     """
     table = observations.table
     points = float(table.loc[~table["is_area"], "length_m"].sum()) / options.proximity
@@ -121,7 +119,7 @@ def read_looks(observations: Observations, local_maps: Sequence[LocalMaps], opti
             f"more than the {MOST_POINTS / 1e6:.0f} million that memory is sure to hold; choose a larger proximity, or "
             "merge the data in parts"
         )
-    instances, instance = _with_main_map(table, local_maps, observations.crs, options.proximity)
+    instances, instance = read_instances(observations, local_maps, options.proximity)
     weight = table["weight"].to_numpy(dtype=float) * np.maximum(table["score"].to_numpy(dtype=float), _LEAST_WEIGHT)
     is_area = table["is_area"].to_numpy(dtype=bool)
     lines, areas = (_by_class(table, np.flatnonzero(kind)) for kind in (~is_area, is_area))
@@ -129,74 +127,7 @@ def read_looks(observations: Observations, local_maps: Sequence[LocalMaps], opti
     return Given(table, instances, instance, weight, lines, areas, options.proximity, past)
 
 
-def _with_main_map(
-    table: pd.DataFrame, local_maps: Sequence[LocalMaps], crs: pyproj.CRS, unit: float
-) -> tuple[Instances, Index]:
-    """Return the local maps, the main map as what was known before, and which of them each observation is of."""
-    main = table["is_main"].to_numpy(dtype=bool)
-    instances, codes = read_instances(table[~main], local_maps, crs)
-    if not main.any():
-        return instances, codes
-    # A map covers the place that it is of: who looks there and sees what it does not show, sees something else.
-    bounds = shapely.total_bounds(table["shape"].to_numpy(dtype=object)[main])
-    instances = instances.with_known(shapely.buffer(shapely.box(*bounds), REACH * unit, join_style="mitre"))
-    instance = np.full(len(table), instances.known)
-    instance[~main] = codes
-    return instances, instance
-
-
 def _by_class(table: pd.DataFrame, rows: Index) -> list[tuple[str, Index]]:
     """Return the classes of some observations in order, and which are of each."""
     groups = table.iloc[rows].groupby("class").indices
     return [(str(name), rows[np.asarray(members)]) for name, members in sorted(groups.items())]
-
-
-def read_instances(table: pd.DataFrame, local_maps: Sequence[LocalMaps], crs: pyproj.CRS) -> tuple[Instances, Index]:
-    """Bring the local maps of a merge together: those of the observations, then those that saw nothing.
-
-    Parameters
-    ----------
-    table : DataFrame
-        The observations, with `drive`, `instance` and `group`.
-    local_maps : sequence of LocalMaps
-        Their layers, with `instances` where these are known.
-    crs : pyproj.CRS
-        Of the work.
-
-    Returns
-    -------
-    instances : Instances
-        Footprints are known where they are of all local maps.
-    instance : ndarray of int
-        The local map of each observation.
-    """
-    codes, groups = pd.factorize(table["group"])
-    firsts = table.drop_duplicates("group").set_index("group").loc[groups]
-    names = firsts[["drive", "instance"]].astype(str).reset_index(drop=True)
-    frames = [_known(maps.instances, crs) for maps in local_maps if maps.instances is not None]
-    known = pd.concat([names.iloc[:0], *frames], ignore_index=True).drop_duplicates(["drive", "instance"])
-    every = pd.concat([names, known[["drive", "instance"]]], ignore_index=True)
-    # Local maps that have observations come first, also where several go by one name.
-    every = every[~(every.duplicated() & (np.arange(len(every)) >= len(names)))]
-    rows = pd.MultiIndex.from_frame(known[["drive", "instance"]]).get_indexer(pd.MultiIndex.from_frame(every))
-    position, heading, footprint = np.full((len(every), 2), np.nan), np.full(len(every), np.nan), None
-    there = rows >= 0
-    if there.any():
-        position[there] = known[["x", "y"]].to_numpy(dtype=float)[rows[there]]
-        heading[there] = known["heading"].to_numpy(dtype=float)[rows[there]]
-    if there.all() and len(every):
-        footprint = known["footprint"].to_numpy(dtype=object)[rows]
-        shapely.prepare(footprint)
-    return Instances(pd.factorize(every["drive"])[0], footprint, position, heading), codes
-
-
-def _known(frame: gpd.GeoDataFrame, crs: pyproj.CRS) -> pd.DataFrame:
-    """Return drive, instance, position, heading (radians counter-clockwise from x) and footprint, in the work's CRS."""
-    places, areas = frame[["x", "y"]].to_numpy(dtype=float), frame.geometry.to_numpy()
-    if frame.crs is not None and frame.crs != crs:
-        source = pyproj.CRS.from_user_input(frame.crs)
-        places = transform_coordinates(places, source, crs)
-        areas = shapely.transform(areas, lambda xy: transform_coordinates(xy, source, crs))
-    columns = {name: frame[name].astype(str).to_numpy() for name in ("drive", "instance")}
-    heading = np.radians(90.0 - frame["heading"].to_numpy(dtype=float))
-    return pd.DataFrame({**columns, "x": places[:, 0], "y": places[:, 1], "heading": heading, "footprint": areas})

@@ -17,9 +17,9 @@ from polymerge_core.consensus.lines import Lines, merge_lines
 from polymerge_core.consensus.looks import Looks
 from polymerge_core.consensus.support import succession
 from polymerge_core.curves import Array, Curves, Index
-from polymerge_core.observations import MIN_SEGMENT_M, Observations
+from polymerge_core.observations import MIN_SEGMENT_M, Observations, list_left_out
 from polymerge_core.options import Options
-from polymerge_core.schema import LEFT_OUT_COLUMNS, LocalMaps
+from polymerge_core.schema import LocalMaps
 from polymerge_core.sets import ElementSets
 
 #: Why a piece of an observation is in no element.
@@ -177,13 +177,12 @@ def _put_together(
         np.concatenate([getattr(each, name) for each in found])[used] if found else np.empty(0, dtype=object)
         for name in ("shapes", "sigma", "seen", "expected")
     )
-    left_out = table[~inside].assign(reason=UNSUPPORTED)[list(LEFT_OUT_COLUMNS)]
-    listed = pd.concat([observations.left_out, left_out], ignore_index=True)
+    left_out = list_left_out([observations.left_out, table[~inside].assign(reason=UNSUPPORTED)])
     chosen = replace(
         observations,
         table=kept,
         attributes=observations.attributes.iloc[pieces.row[inside]].reset_index(drop=True),
-        left_out=listed,
+        left_out=left_out,
     )
     sets = _sets(kept, component, len(used))
     base = kept.iloc[sets.base]
