@@ -95,7 +95,7 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
     score_field: str | None = None,
     min_score: float = 0.0,
     timestamp_field: str | None = None,
-    method: str = "polymerge",
+    method: str = "consensus",
     proximity: float = 1.0,
     coverage: float = 0.5,
     area: str | Sequence[str] = (),
