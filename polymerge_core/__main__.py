@@ -129,7 +129,7 @@ def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None
 @cli.command()
 @click.argument("local_maps", nargs=-1, required=True, metavar="LOCAL...")
 @_reading_options
-@click.option("--method", type=click.Choice(METHODS), default="polymerge", show_default=True)
+@click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True)
 @click.option("--coverage", type=float, default=0.5, show_default=True, help="Th_cov, for area classes.")
 @click.option(
     "--aggregate",

@@ -119,7 +119,7 @@ def _features(layer: Layer, options: Options, *, several: bool, notes: dict[str,
     _read_instance(find, layer, options, table, several=several, notes=notes)
     _read_score(find, options, table)
     table["timestamp_ns"] = _read_timestamp(find("timestamp", options.timestamp_field), layer.where)
-    sigma = find("sigma", None)
+    sigma = find("sigma_m" if layer.is_main else "sigma", None)
     table["sigma"] = np.nan if sigma is None else pd.to_numeric(sigma, errors="coerce").to_numpy(dtype=float)
     _read_main(find, layer, table)
     return table, find.used
@@ -154,7 +154,7 @@ def _read_class(find: _Finder, options: Options, table: pd.DataFrame) -> pd.Seri
         return pd.Series(options.class_name, index=table.index, dtype=object)
     missing = column.isna().to_numpy()
     _leave_out(table, missing, "no class")
-    return _as_text(column).where(~missing, "")
+    return as_text(column).where(~missing, "")
 
 
 def _read_instance(
@@ -175,7 +175,7 @@ def _read_instance(
     if column is not None:
         missing = column.isna().to_numpy()
         _leave_out(table, missing, "no instance")
-        table["instance"] = _as_text(column).where(~missing, "")
+        table["instance"] = as_text(column).where(~missing, "")
     elif rule == "layer":
         table["instance"] = layer.maps.source
     else:
@@ -309,7 +309,7 @@ def _join_attributes(tables: list[pd.DataFrame], notes: dict[str, Any]) -> pd.Da
     clashing = sorted(name for name, found in kinds.items() if len(found) > 1)
     if clashing:
         notes["warnings"].append(f"columns of different types became text: {', '.join(clashing)}")
-    cast = [table.assign(**{name: _as_text(table[name]) for name in clashing if name in table}) for table in tables]
+    cast = [table.assign(**{name: as_text(table[name]) for name in clashing if name in table}) for table in tables]
     # Not every layer has every column; int64 would turn to float where one is missing.
     return pd.concat([_nullable(table) for table in cast], ignore_index=True)
 
@@ -351,10 +351,10 @@ def _note_missing_class(features: pd.DataFrame, notes: dict[str, Any]) -> None:
 def _read_text(column: pd.Series | None, *, default: str) -> pd.Series | str:
     if column is None:
         return default
-    return _as_text(column).where(column.notna(), default)
+    return as_text(column).where(column.notna(), default)
 
 
-def _as_text(column: pd.Series) -> pd.Series:
+def as_text(column: pd.Series) -> pd.Series:
     """Return values as text; whole numbers without a decimal point, whatever type a format gave them."""
     if pd.api.types.is_float_dtype(column) and (column.dropna() % 1 == 0).all():
         column = column.astype("Int64")

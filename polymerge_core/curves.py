@@ -18,6 +18,9 @@ Index = NDArray[np.intp]
 #: Places along lines nearer to each other than this are the same, metres.
 _SAME = 1e-9
 
+#: Nearer than this to an end of a line is at the end, metres.
+_END = 1e-6
+
 
 class Pieces(NamedTuple):
     """Lines cut into pieces of even length, one entry a piece, line by line."""
@@ -96,9 +99,15 @@ class Curves:
         return np.column_stack(tuple(axes))
 
     def locate(self, line: Index, points: Array) -> Array:
-        """Return the positions of the projections of points onto lines (paper, eq. 2), shape (m,)."""
+        """Return the positions of the projections of points onto lines (paper, eq. 2), shape (m,).
+
+        What falls onto an end is exactly at it: 0, or the length.
+        """
         found: Array = shapely.line_locate_point(self.lines[line], shapely.points(points))
-        return found
+        length = self.length[line]
+        # Both lengths are sums, which round differently.
+        found = np.where(found > length - _END, length, found)
+        return np.where(found < _END, 0.0, found)
 
     def pieces(self, step: float) -> Pieces:
         """Cut every line into equal pieces of at most `step` metres."""

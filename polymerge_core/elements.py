@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from polymerge_core.errors import OptionError
 from polymerge_core.observations import Observations, as_lines
 from polymerge_core.options import Options
-from polymerge_core.schema import ALIAS_COLUMNS, LINEAGE_COLUMNS
+from polymerge_core.schema import ALIAS_COLUMNS, LINEAGE_COLUMNS, NO_ELEMENT
 from polymerge_core.sets import ElementSets
 
 
@@ -47,7 +47,7 @@ def build_elements(
     ids : ndarray of int, shape (m,)
         The `element_id` of each component.
     aliases : DataFrame
-        `old_id`, `element_id` of the main map's ids that are no more.
+        `old_id`, `element_id` of the main map's ids that are no more; `NO_ELEMENT` where nothing is left.
     """
     table, component, base = observations.table, sets.component, sets.base
     ids, aliases = _assign_ids(observations, sets, shapes)
@@ -100,9 +100,10 @@ def _assign_ids(
     An id that once meant another element is never given again, and what became of it stays on record.
     """
     table, component, base = observations.table, sets.component, sets.base
-    known = pd.DataFrame({"old_id": table["main_id"], "component": component})
-    # The parts of one multi-part element share its id; only the first keeps it.
-    known = known[known["old_id"] >= 0].drop_duplicates("old_id")
+    known = pd.DataFrame({"old_id": table["main_id"], "component": component, "length_m": table["length_m"]})
+    # What is left of one element may be in several: the parts of a multi-part one, or what it was cut into.
+    share = known[known["old_id"] >= 0].groupby(["old_id", "component"], sort=False)["length_m"].sum().round(6)
+    known = share.reset_index().sort_values("length_m", ascending=False, kind="stable").drop_duplicates("old_id")
     kept = known.groupby("component")["old_id"].min()
     ids = np.full(len(base), -1, dtype=np.int64)
     ids[kept.index] = kept.to_numpy()
@@ -111,7 +112,8 @@ def _assign_ids(
     _, name = np.unique(table["class"].to_numpy(dtype=str)[base[fresh]], return_inverse=True)
     order = fresh[np.lexsort((base[fresh], key, name))]
     ids[order] = observations.highest_id + 1 + np.arange(len(order))
-    aliases = known.assign(element_id=ids[known["component"]])
+    gone = pd.DataFrame({"old_id": np.setdiff1d(observations.main_ids, known["old_id"]), "element_id": NO_ELEMENT})
+    aliases = pd.concat([known.assign(element_id=ids[known["component"]]), gone])
     aliases = aliases.loc[aliases["old_id"] != aliases["element_id"], list(ALIAS_COLUMNS)]
     now = dict(zip(aliases["old_id"], aliases["element_id"], strict=True))
     earlier = observations.id_aliases
@@ -123,6 +125,8 @@ def _assign_ids(
 def _count_instances(table: pd.DataFrame, component: NDArray[np.intp], count: int) -> NDArray[np.int64]:
     """Count the local maps in each component; a main map's element brings its own count, or the map counts once."""
     seen = pd.DataFrame({"component": component, "group": table["group"], "looks": table["looks"]})
+    # Another piece of what is in the element already.
+    seen = seen[table["weight"] > 0]
     counted = seen["looks"] > 0
     distinct = seen[~counted].drop_duplicates(["component", "group"])
     looks = seen[counted]

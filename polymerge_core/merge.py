@@ -33,7 +33,7 @@ from polymerge_core.schema import (
     LINEAGE_TABLE,
     LocalMaps,
 )
-from polymerge_core.sets import ElementSets, Input, Progress, as_local_maps, find_network, order_sets
+from polymerge_core.sets import ElementSets, Input, Progress, as_local_maps, find_network, note_layers_apart, order_sets
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ class MergeResult:
     left_out : DataFrame
         What is in no element, with a reason. With `lineage` it covers each observation exactly once.
     id_aliases : DataFrame
-        Ids of main-map elements that became part of another one: `old_id`, `element_id`.
+        Ids of main-map elements that became part of another one: `old_id`, `element_id`; -1 where all of the element is
+        left out.
     report : dict
         Counts, options, CRSs and warnings; ready for JSON.
     """
@@ -94,7 +95,7 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
     score_field: str | None = None,
     min_score: float = 0.0,
     timestamp_field: str | None = None,
-    method: str = "polymerge",
+    method: str = "consensus",
     proximity: float = 1.0,
     coverage: float = 0.5,
     area: str | Sequence[str] = (),
@@ -213,6 +214,7 @@ def _merge_by_consensus(local_maps: Input, main_map: Input | None, options: Opti
     main: list[LocalMaps] = [] if main_map is None else as_local_maps(main_map, "main_map")
     layers = as_local_maps(local_maps, "local_maps")
     observations = observe(layers, main, options)
+    note_layers_apart(observations, options)
     merged = merge_by_consensus(
         observations, layers, options, lambda share: progress(0.1 + 0.85 * share, "finding the consensus")
     )

@@ -62,6 +62,8 @@ class Observations:
         CRS of each layer, by the number in ``table["layer"]``.
     id_aliases : DataFrame
         What became of ids of the main map in earlier merges: `old_id`, `element_id`.
+    main_ids : ndarray of int
+        Ids of the main map's elements, also of those that cannot be used.
     highest_id : int
         The highest id that the main map ever gave, 0 where there is none.
     notes : dict
@@ -75,6 +77,7 @@ class Observations:
     out_crs: pyproj.CRS
     layer_crs: list[pyproj.CRS]
     id_aliases: pd.DataFrame
+    main_ids: NDArray[np.int64]
     highest_id: int
     notes: dict[str, Any] = field(default_factory=dict)
 
@@ -147,8 +150,9 @@ def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], opti
         _note_like_degrees(table, notes)
     known = [maps.id_aliases[list(ALIAS_COLUMNS)] for maps in main_map if maps.id_aliases is not None]
     aliases = pd.concat([empty_table(ALIAS_COLUMNS), *known], ignore_index=True)
-    highest = max(0, features["main_id"].max(), *aliases.max(skipna=True).fillna(0).astype(int))
-    return Observations(table, attributes, left_out, work, out_crs, layer_crs, aliases, int(highest), notes)
+    main_ids = features.loc[features["main_id"] >= 0, "main_id"].to_numpy(dtype=np.int64)
+    highest = max(0, main_ids.max(initial=0), *aliases.max(skipna=True).fillna(0).astype(int))
+    return Observations(table, attributes, left_out, work, out_crs, layer_crs, aliases, main_ids, int(highest), notes)
 
 
 def as_lines(shapes: NDArray[np.object_]) -> NDArray[np.object_]:
@@ -351,9 +355,25 @@ def _note_like_degrees(table: pd.DataFrame, notes: dict[str, Any]) -> None:
 
 
 def _left_out(parts: pd.DataFrame, local_maps: list[LocalMaps]) -> pd.DataFrame:
-    """List what was left out here and before, in canonical order."""
+    """List what was left out here and before."""
     earlier = [maps.left_out for maps in local_maps if maps.left_out is not None and len(maps.left_out)]
-    listed = pd.concat([parts[list(LEFT_OUT_COLUMNS)], *(table[list(LEFT_OUT_COLUMNS)] for table in earlier)])
+    return list_left_out([parts, *earlier])
+
+
+def list_left_out(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """List what was left out, in canonical order.
+
+    Parameters
+    ----------
+    tables : sequence of DataFrame
+        Each with `LEFT_OUT_COLUMNS`, and maybe more.
+
+    Returns
+    -------
+    DataFrame
+        `LEFT_OUT_COLUMNS` of all.
+    """
+    listed = pd.concat([table[list(LEFT_OUT_COLUMNS)] for table in tables])
     listed["instance"] = listed["instance"].astype(str)
     keys = ["source", "drive", "instance", "reason", "from_m", "to_m", "source_fid"]
     text = listed["source_fid"].astype(str)

@@ -15,7 +15,8 @@ from typing import Any
 from polymerge_core.errors import OptionError
 from polymerge_core.schema import AREA_CLASSES
 
-METHODS = ("polymerge", "consensus")
+#: How observations become elements, the default first.
+METHODS = ("consensus", "polymerge")
 INSTANCE_FROM = ("column", "layer", "feature")
 AGGREGATES = ("first", "mode", "mean", "min", "max", "sum")
 
@@ -41,7 +42,7 @@ class Options:
     score_field: str | None = None
     min_score: float = 0.0
     timestamp_field: str | None = None
-    method: str = "polymerge"
+    method: str = METHODS[0]
     proximity: float = 1.0
     coverage: float = 0.5
     area: frozenset[str] = AREA_CLASSES

@@ -38,6 +38,9 @@ LINEAGE_COLUMNS = ("source", "source_fid", "drive", "instance", "element_id", "f
 LEFT_OUT_COLUMNS = (*INTERVAL_COLUMNS, "reason")
 ALIAS_COLUMNS = ("old_id", "element_id")
 
+#: In the table of aliases: what became of an element of the main map that is in no element any more.
+NO_ELEMENT = -1
+
 
 @dataclass(frozen=True)
 class LocalMaps:
@@ -56,7 +59,7 @@ class LocalMaps:
     left_out : DataFrame, optional
         What was left out before this point, in the columns `LEFT_OUT_COLUMNS`.
     id_aliases : DataFrame, optional
-        Of a merged map: the ids that became part of another one, `old_id` and `element_id`.
+        Of a merged map: the ids that are no more, `old_id`, and what each is part of, `element_id` (-1: of nothing).
     """
 
     observations: gpd.GeoDataFrame

@@ -99,7 +99,7 @@ def find_network(
     observations = observe(as_local_maps(local_maps, "local_maps"), main, options)
     progress(0.1, "looking for neighbours")
     edges = _edges(observations, options, progress, distances=distances)
-    _note_layers_apart(observations, options)
+    note_layers_apart(observations, options)
     return Network(observations, edges, components(len(observations.table), edges))
 
 
@@ -133,8 +133,16 @@ def order_sets(network: Network) -> ElementSets:
     return ElementSets(component, base, order, np.append(starts, len(table)).astype(np.intp))
 
 
-def _note_layers_apart(observations: Observations, options: Options) -> None:
-    """Say when features of one layer stay apart only because the layer was taken for one local map."""
+def note_layers_apart(observations: Observations, options: Options) -> None:
+    """Say when features of one layer stay apart only because the layer was taken for one local map.
+
+    Parameters
+    ----------
+    observations : Observations
+        The warning is added to their notes.
+    options : Options
+        Whether the user chose so, and the proximity.
+    """
     table = observations.table
     if options.instance_from is not None or table.empty:
         return

@@ -52,7 +52,7 @@ class Areas(NamedTuple):
     seen, expected : ndarray of float, shape (m,)
         Local maps that saw each, and that should have; 0 where footprints are not known.
     element : ndarray of int, shape (n,)
-        The merged area of each look; -1 where it was left out.
+        The merged area of each look, what was known before last; -1 where it was left out.
     known : KnownAreas
         What is known of all areas, also of those that too few saw so far.
     """
@@ -128,7 +128,7 @@ def merge_looks_at_areas(
         sigma[kept],
         support.seen[kept].astype(np.float64),
         support.expected[kept],
-        number[group[:count]],
+        number[group],
         known,
     )
 

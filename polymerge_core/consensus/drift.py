@@ -11,6 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import shapely
+from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
@@ -44,6 +46,12 @@ class Drift(NamedTuple):
         if len(self.drive) == 0:
             return np.zeros((len(points), 2))
         return np.asarray(_kernel(drive, points, self.drive, self.place, self.reach) @ self.push)
+
+    def followed(self, shapes: NDArray[np.object_], drive: Index) -> NDArray[np.object_]:
+        """Return shapes of given drives, each shifted as a whole as its middle is."""
+        shift = self.at(drive, shapely.get_coordinates(shapely.centroid(shapes)))
+        points, owner = shapely.get_coordinates(shapes, return_index=True)
+        return np.asarray(shapely.set_coordinates(shapes.copy(), points + shift[owner]))
 
 
 def no_drift() -> Drift:

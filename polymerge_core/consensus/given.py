@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import geopandas as gpd
 import numpy as np
 import pandas as pd
-import pyproj
-import shapely
 from numpy.typing import NDArray
 
 from polymerge_core.consensus.areas import Areas, merge_looks_at_areas
+from polymerge_core.consensus.drift import Drift
+from polymerge_core.consensus.instances import read_instances
 from polymerge_core.consensus.known import KnownAreas
 from polymerge_core.consensus.looks import Instances, Looks
+from polymerge_core.consensus.main_map import remembered
 from polymerge_core.consensus.registration import centres, moved_by
-from polymerge_core.crs import transform_coordinates
 from polymerge_core.curves import Array, Index
 from polymerge_core.errors import InputError
 from polymerge_core.observations import Observations
@@ -55,25 +54,42 @@ class Given:
     lines: list[tuple[str, Index]]
     areas: list[tuple[str, Index]]
     unit: float
+    past: Array
 
     def looks_of(self, rows: Index) -> Looks:
         """Return the looks of one class of lines."""
         shapes = self.table["shape"].to_numpy(dtype=object)
-        return Looks.of(shapes[rows], self.instance[rows], self.weight[rows], self.instances, self.unit)
+        looks = Looks.of(shapes[rows], self.instance[rows], self.weight[rows], self.instances, self.unit)
+        return looks.remembering(self.past[rows][looks.owner])
 
-    def followed(self, looks: list[Looks], corrections: Array) -> NDArray[np.object_]:
+    def followed(self, looks: list[Looks], corrections: Array, drift: Drift) -> NDArray[np.object_]:
         """Return the shapes of all observations, areas moved as the lines say that their local maps were off."""
         shapes = self.table["shape"].to_numpy(dtype=object, copy=True)
         rows = np.concatenate([rows for _, rows in self.areas]) if self.areas else np.empty(0, np.intp)
         if looks and len(rows):
             centre = centres(looks, len(self.instances))
-            shapes[rows] = moved_by(shapes[rows], self.instance[rows], corrections, centre)
+            known = self._known(rows)
+            new, old = rows[~known], rows[known]
+            shapes[new] = moved_by(shapes[new], self.instance[new], corrections, centre)
+            shapes[old] = drift.followed(shapes[old], self.instances.drive[self.instance[old]])
         return shapes
 
     def merge_areas(self, shapes: NDArray[np.object_], rows: Index, before: KnownAreas | None = None) -> Areas:
-        """Merge one class of areas, given the shapes of all observations."""
-        chosen = (shapes[rows], self.instance[rows], self.weight[rows])
-        return merge_looks_at_areas(*chosen, self.instances, self.unit, before)
+        """Merge one class of areas, given the shapes of all observations and, without a main map, what was known."""
+        known = self._known(rows)
+        new, old = rows[~known], rows[known]
+        if len(old):
+            before = KnownAreas(shapes[old], self.weight[old], np.ones(len(old), bool), self.past[old, 1:])
+        areas = merge_looks_at_areas(
+            shapes[new], self.instance[new], self.weight[new], self.instances, self.unit, before
+        )
+        element = np.empty(len(rows), np.intp)
+        element[np.argsort(known, kind="stable")] = areas.element[: len(rows)]
+        return areas._replace(element=element)
+
+    def _known(self, rows: Index) -> NDArray[np.bool_]:
+        """Tell elements of the main map from new observations."""
+        return np.asarray(self.instance[rows] == self.instances.known)
 
 
 def read_looks(observations: Observations, local_maps: Sequence[LocalMaps], options: Options) -> Given:
@@ -92,6 +108,8 @@ def read_looks(observations: Observations, local_maps: Sequence[LocalMaps], opti
     ------
     InputError
         If the proximity is too small for so much length.
+    SchemaError
+        If it cannot be told which local map a footprint is of.
     """
     table = observations.table
     points = float(table.loc[~table["is_area"], "length_m"].sum()) / options.proximity
@@ -101,65 +119,15 @@ def read_looks(observations: Observations, local_maps: Sequence[LocalMaps], opti
             f"more than the {MOST_POINTS / 1e6:.0f} million that memory is sure to hold; choose a larger proximity, or "
             "merge the data in parts"
         )
-    instances, instance = read_instances(table, local_maps, observations.crs)
+    instances, instance = read_instances(observations, local_maps, options.proximity)
     weight = table["weight"].to_numpy(dtype=float) * np.maximum(table["score"].to_numpy(dtype=float), _LEAST_WEIGHT)
     is_area = table["is_area"].to_numpy(dtype=bool)
     lines, areas = (_by_class(table, np.flatnonzero(kind)) for kind in (~is_area, is_area))
-    return Given(table, instances, instance, weight, lines, areas, options.proximity)
+    past = remembered(table, instance, instances.drive, options.proximity)
+    return Given(table, instances, instance, weight, lines, areas, options.proximity, past)
 
 
 def _by_class(table: pd.DataFrame, rows: Index) -> list[tuple[str, Index]]:
     """Return the classes of some observations in order, and which are of each."""
     groups = table.iloc[rows].groupby("class").indices
     return [(str(name), rows[np.asarray(members)]) for name, members in sorted(groups.items())]
-
-
-def read_instances(table: pd.DataFrame, local_maps: Sequence[LocalMaps], crs: pyproj.CRS) -> tuple[Instances, Index]:
-    """Bring the local maps of a merge together: those of the observations, then those that saw nothing.
-
-    Parameters
-    ----------
-    table : DataFrame
-        The observations, with `drive`, `instance` and `group`.
-    local_maps : sequence of LocalMaps
-        Their layers, with `instances` where these are known.
-    crs : pyproj.CRS
-        Of the work.
-
-    Returns
-    -------
-    instances : Instances
-        Footprints are known where they are of all local maps.
-    instance : ndarray of int
-        The local map of each observation.
-    """
-    codes, groups = pd.factorize(table["group"])
-    firsts = table.drop_duplicates("group").set_index("group").loc[groups]
-    names = firsts[["drive", "instance"]].astype(str).reset_index(drop=True)
-    frames = [_known(maps.instances, crs) for maps in local_maps if maps.instances is not None]
-    known = pd.concat([names.iloc[:0], *frames], ignore_index=True).drop_duplicates(["drive", "instance"])
-    every = pd.concat([names, known[["drive", "instance"]]], ignore_index=True)
-    # Local maps that have observations come first, also where several go by one name.
-    every = every[~(every.duplicated() & (np.arange(len(every)) >= len(names)))]
-    rows = pd.MultiIndex.from_frame(known[["drive", "instance"]]).get_indexer(pd.MultiIndex.from_frame(every))
-    position, heading, footprint = np.full((len(every), 2), np.nan), np.full(len(every), np.nan), None
-    there = rows >= 0
-    if there.any():
-        position[there] = known[["x", "y"]].to_numpy(dtype=float)[rows[there]]
-        heading[there] = known["heading"].to_numpy(dtype=float)[rows[there]]
-    if there.all() and len(every):
-        footprint = known["footprint"].to_numpy(dtype=object)[rows]
-        shapely.prepare(footprint)
-    return Instances(pd.factorize(every["drive"])[0], footprint, position, heading), codes
-
-
-def _known(frame: gpd.GeoDataFrame, crs: pyproj.CRS) -> pd.DataFrame:
-    """Return drive, instance, position, heading (radians counter-clockwise from x) and footprint, in the work's CRS."""
-    places, areas = frame[["x", "y"]].to_numpy(dtype=float), frame.geometry.to_numpy()
-    if frame.crs is not None and frame.crs != crs:
-        source = pyproj.CRS.from_user_input(frame.crs)
-        places = transform_coordinates(places, source, crs)
-        areas = shapely.transform(areas, lambda xy: transform_coordinates(xy, source, crs))
-    columns = {name: frame[name].astype(str).to_numpy() for name in ("drive", "instance")}
-    heading = np.radians(90.0 - frame["heading"].to_numpy(dtype=float))
-    return pd.DataFrame({**columns, "x": places[:, 0], "y": places[:, 1], "heading": heading, "footprint": areas})

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from polymerge_core.consensus.drift import Drift, no_drift
 from polymerge_core.consensus.drives import join_drives
+from polymerge_core.consensus.fusion import Fit
 from polymerge_core.consensus.known import KnownLines, known_lines
-from polymerge_core.consensus.looks import Looks
-from polymerge_core.consensus.meetings import met
+from polymerge_core.consensus.looks import PAST, Looks
 from polymerge_core.consensus.registration import centres, corrections, equations
-from polymerge_core.consensus.support import means, shapes_of, stretch_of, support, supported_stretches
+from polymerge_core.consensus.support import Support, means, shapes_of, stretch_of, support, supported_stretches
 from polymerge_core.consensus.tracing import State, moved, trace
 from polymerge_core.curves import Array, Index
 
@@ -99,24 +99,28 @@ def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tup
         states = [moved(state, step, centre) for state in states]
         corrected += step
         advance(0.6 + 0.35 * (number + 1) / _CORRECTIONS)
-    return _meeting(states, [_finish(state) for state in states]), shifted + corrected, drift
-
-
-def _meeting(states: list[State], lines: list[Lines]) -> list[Lines]:
-    """Draw the lines of all classes to what they meet."""
-    first = np.cumsum([0, *(len(each.shapes) for each in lines)])
-    element = [np.where(each.element >= 0, each.element + start, -1) for each, start in zip(lines, first, strict=False)]
-    shapes = met(np.concatenate([each.shapes for each in lines]), [state.looks for state in states], element)
-    parts = np.split(shapes, first[1:-1])
-    return [each._replace(shapes=part) for each, part in zip(lines, parts, strict=True)]
+    return [_finish(state) for state in states], shifted + corrected, drift
 
 
 def _finish(state: State) -> Lines:
     """Trim the lines to what is supported, and say where each point of the looks went."""
     looks, fit = state.looks, state.fit
-    found = support(looks, state.group, fit)
+    found = _at_least_by_their_own(looks, fit, support(looks, state.group, fit))
     stretches = supported_stretches(fit.axes, found)
     shapes = shapes_of(fit.axes.stations, stretches, _TOLERANCE * looks.unit)
     element = stretch_of(stretches, fit.feet.station)
     known = known_lines(fit.axes, fit.knowledge, found)
     return Lines(shapes, *means(found, fit.error, stretches), element, known)
+
+
+def _at_least_by_their_own(looks: Looks, fit: Fit, found: Support) -> Support:
+    """Count each place as seen by those who say that it is there, also where smoothing took it out of their reach.
+
+    A line that nobody missed is whole: nothing may be left out of it.
+    """
+    axes, past = fit.axes, np.nan_to_num(looks.past, nan=1.0)
+    whole = np.bincount(axes.line, found.expected > found.seen)[axes.line] == 0
+    least = {name: whole.astype(np.float64) for name in ("seen", "seen_drives")}
+    for name, seen in least.items():
+        np.maximum.at(seen, fit.feet.station, past[:, PAST.index(name)])
+    return found._replace(**{name: np.maximum(getattr(found, name), seen) for name, seen in least.items()})

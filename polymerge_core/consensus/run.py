@@ -15,15 +15,20 @@ from polymerge_core.consensus.areas import Areas
 from polymerge_core.consensus.given import read_looks
 from polymerge_core.consensus.lines import Lines, merge_lines
 from polymerge_core.consensus.looks import Looks
+from polymerge_core.consensus.meetings import met
+from polymerge_core.consensus.registration import centres, corrected
 from polymerge_core.consensus.support import succession
 from polymerge_core.curves import Array, Curves, Index
-from polymerge_core.observations import MIN_SEGMENT_M, Observations
+from polymerge_core.observations import MIN_SEGMENT_M, Observations, list_left_out
 from polymerge_core.options import Options
-from polymerge_core.schema import LEFT_OUT_COLUMNS, LocalMaps
+from polymerge_core.schema import LocalMaps
 from polymerge_core.sets import ElementSets
 
 #: Why a piece of an observation is in no element.
 UNSUPPORTED = "seen by too few of the local maps that looked there"
+
+#: What is less than this is nothing.
+_ROUNDING = 1e-6
 
 #: An observation is not cut into pieces shorter than this, proximities.
 _PIECE = 2.0
@@ -82,7 +87,7 @@ def merge_by_consensus(
     Returns
     -------
     Consensus
-        Elements by class; lines before areas.
+        Elements by class; lines before areas. Elements of the main map take part as what was known before.
 
     Raises
     ------
@@ -91,8 +96,8 @@ def merge_by_consensus(
     """
     given = read_looks(observations, local_maps, options)
     looks = [given.looks_of(rows) for _, rows in given.lines]
-    lines, corrections, _ = merge_lines(looks, lambda share: advance(0.9 * share))
-    shapes = given.followed(looks, corrections)
+    lines, corrections, drift = merge_lines(looks, lambda share: advance(0.9 * share))
+    shapes = given.followed(looks, corrections, drift)
     found: list[Lines | Areas] = []
     pieces: list[_Pieces] = []
     for (_, rows), each, seen in zip(given.lines, lines, looks, strict=True):
@@ -103,7 +108,29 @@ def merge_by_consensus(
         pieces.append(_pieces_of_areas(rows, area, sum(len(one.shapes) for one in found)))
         found.append(area)
     advance(1.0)
-    return _put_together(observations, found, _joined(pieces), corrections)
+    moved = corrections[np.arange(len(corrections)) != given.instances.known]
+    merged, used = _put_together(observations, found, _joined(pieces), moved)
+    return replace(merged, shapes=_meeting(merged.shapes, used, lines, looks, corrections))
+
+
+def _meeting(
+    shapes: NDArray[np.object_], used: Index, lines: list[Lines], looks: list[Looks], corrections: Array
+) -> NDArray[np.object_]:
+    """Draw the lines of all classes to what they meet; they come before the areas."""
+    first = np.cumsum([0, *(len(each.shapes) for each in lines)])
+    count = int(np.searchsorted(used, first[-1]))
+    if count == 0:
+        return shapes
+    number = np.full(first[-1] + 1, -1)
+    number[used[:count]] = np.arange(count)
+    # What was left out, -1, has the last number, which is no element.
+    element = [
+        number[np.where(each.element < 0, -1, each.element + start)]
+        for each, start in zip(lines, first[:-1], strict=True)
+    ]
+    centre = centres(looks, len(corrections))
+    moved = [corrected(each, corrections, centre) for each in looks]
+    return np.concatenate([met(shapes[:count], moved, element), shapes[count:]])
 
 
 def _pieces_of_lines(rows: Index, lines: Lines, looks: Looks, first: int, shortest: float) -> _Pieces:
@@ -160,8 +187,11 @@ def _joined(pieces: list[_Pieces]) -> _Pieces:
 
 def _put_together(
     observations: Observations, found: list[Lines | Areas], pieces: _Pieces, corrections: Array
-) -> Consensus:
-    """Make the tables of a merge from elements and pieces; an element that no piece is left of is none."""
+) -> tuple[Consensus, Index]:
+    """Make the tables of a merge from elements and pieces, and say which of the elements found are in it.
+
+    An element that no piece is left of is none.
+    """
     order = np.lexsort((pieces.start, pieces.row))
     pieces = _Pieces._make(column[order] for column in pieces)
     inside = pieces.element >= 0
@@ -173,23 +203,38 @@ def _put_together(
         np.concatenate([getattr(each, name) for each in found])[used] if found else np.empty(0, dtype=object)
         for name in ("shapes", "sigma", "seen", "expected")
     )
-    left_out = table[~inside].assign(reason=UNSUPPORTED)[list(LEFT_OUT_COLUMNS)]
-    listed = pd.concat([observations.left_out, left_out], ignore_index=True)
+    left_out = list_left_out([observations.left_out, table[~inside].assign(reason=UNSUPPORTED)])
     chosen = replace(
         observations,
         table=kept,
         attributes=observations.attributes.iloc[pieces.row[inside]].reset_index(drop=True),
-        left_out=listed,
+        left_out=left_out,
     )
     sets = _sets(kept, component, len(used))
-    # A scribble that turns back on itself may average out to a point: it is better told by its longest look.
-    shapes = np.where(shapely.length(shapes) > MIN_SEGMENT_M, shapes, kept["shape"].to_numpy(dtype=object)[sets.base])
-    total = np.bincount(component, kept["weight"], len(used))
-    mean = np.bincount(component, kept["weight"] * kept["score"], len(used)) / np.maximum(total, 1)
-    # The rule of succession: how surely one that looks there sees it, where it is known who looked there.
-    surely = np.where(expected > 0, succession(seen, expected), 1.0)
-    confidence = mean * surely
-    return Consensus(chosen, sets, shapes, {"score": confidence.astype(float), "sigma_m": sigma}, corrections)
+    base = kept.iloc[sets.base]
+    # What nothing was merged into stays as it is. A scribble that turns back on itself may average out to a point: it
+    # is better told by its longest look.
+    alone = np.bincount(component, minlength=len(used)) == 1
+    stay = alone | (shapely.length(shapes) <= MIN_SEGMENT_M)
+    shapes = np.where(stay, base["shape"].to_numpy(dtype=object), shapes)
+    known = base["sigma"].to_numpy(dtype=float)
+    stay = alone & base["is_main"].to_numpy(dtype=bool) & np.isfinite(known)
+    columns = {
+        "score": _scores(kept, component, seen.astype(float), expected.astype(float)),
+        "sigma_m": np.where(stay, known, sigma.astype(float)),
+    }
+    return Consensus(chosen, sets, shapes, columns, corrections), used
+
+
+def _scores(pieces: pd.DataFrame, component: Index, seen: Array, expected: Array) -> Array:
+    """Return how surely one that looks there sees each element: the mean score, times how often it was seen there."""
+    count = len(seen)
+    total = np.bincount(component, pieces["weight"], count)
+    mean = np.bincount(component, pieces["weight"] * pieces["score"], count) / np.maximum(total, 1)
+    # The score of a main map's element says already how surely it is seen: all that is asked is what is new.
+    known = np.bincount(component, pieces["is_main"], count) > 0
+    share = np.where(known, seen / np.maximum(expected, np.maximum(seen, 1.0)), succession(seen, expected))
+    return np.asarray(np.where(expected > np.where(known, seen + _ROUNDING, 0.0), mean * share, mean))
 
 
 def _piece_table(table: pd.DataFrame, pieces: _Pieces) -> pd.DataFrame:

@@ -129,7 +129,7 @@ def _added(given: Given, state: State | None, crs: pyproj.CRS) -> State:
         looked = None if looked is None or state.looked is None else shapely.union(looked, state.looked)
     names, looks = _looks(given, state)
     lines, corrections, drift = merge_lines(looks, lambda _: None)
-    shapes = given.followed(looks, corrections)
+    shapes = given.followed(looks, corrections, drift)
     before = {} if state is None else {name: _shifted(areas, drift, given) for name, areas in state.areas.items()}
     new = dict(given.areas)
     nothing = np.empty(0, np.intp)
@@ -147,11 +147,8 @@ def _added(given: Given, state: State | None, crs: pyproj.CRS) -> State:
 
 def _shifted(areas: KnownAreas, drift: Drift, given: Given) -> KnownAreas:
     """Return known areas shifted as the lines about them."""
-    middles = shapely.get_coordinates(shapely.centroid(areas.polygons))
-    drive = np.full(len(middles), given.instances.drive[given.instances.known])
-    shift = drift.at(drive, middles)
-    points, owner = shapely.get_coordinates(areas.polygons, return_index=True)
-    return areas._replace(polygons=shapely.set_coordinates(areas.polygons.copy(), points + shift[owner]))
+    drive = np.full(len(areas.polygons), given.instances.drive[given.instances.known])
+    return areas._replace(polygons=drift.followed(areas.polygons, drive))
 
 
 def _looks(given: Given, state: State | None) -> tuple[list[str], list[Looks]]:

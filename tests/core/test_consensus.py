@@ -465,6 +465,76 @@ def test_random_scribbles_are_accounted_for(seed):
     total = (tables["to_m"] - tables["from_m"]).groupby(tables["source_fid"]).sum()
     np.testing.assert_allclose(total.reindex(layer.index), layer.length, atol=1e-6)
     assert np.isfinite(shapely.get_coordinates(result.elements.geometry)).all()
+    # Nobody knows where the local maps looked.
+    assert result.left_out.empty
+
+
+def test_a_ring_that_smoothing_would_lose_is_kept():
+    island = Polygon(box(0, 0, 5, 5).exterior, [box(1, 1, 2, 2).exterior])
+    assert sorted(merge(looks(island, cls="boundary")).elements["length_m"]) == [4, 20]
+
+
+def test_what_is_left_out_is_listed_in_order():
+    lines = [level(0.02 * n) for n in range(12)]
+    layer = looks(*lines, level(6), None, level(-6), instance=[*range(12), 11, 2, 3])
+    reasons = merge(local_maps(layer, [box(-5, -10, 45, 10)] * 12)).left_out
+    assert reasons["instance"].tolist() == ["11", "2", "3"]
+    assert reasons["source_fid"].tolist() == [12, 13, 14]
+
+
+class TestFootprints:
+    """`instances` as users have them: what is not known of them does no harm."""
+
+    AREA = box(-5, -10, 45, 10)
+
+    def left_out(self, change):
+        """Return which features are left out of a layer with one stray line, when the instances are changed."""
+        layer = looks(*(level(0.05 * n) for n in range(5)), level(6.0), instance=[0, 1, 2, 3, 4, 2])
+        maps = local_maps(layer, [self.AREA] * 5)
+        return set(merge(pm.LocalMaps(layer, change(maps.instances), source="drive")).left_out["source_fid"])
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            pytest.param(lambda frame: frame, id="all there"),
+            pytest.param(lambda frame: frame[["drive", "instance", "geometry"]], id="no places"),
+            pytest.param(lambda frame: frame.assign(x=None, y=None, heading=None), id="places not known"),
+            pytest.param(lambda frame: frame.assign(instance=frame["instance"] + 0.0), id="numbers with a point"),
+            pytest.param(lambda frame: frame.set_geometry(shapely.force_3d(frame.geometry)), id="heights"),
+            pytest.param(lambda frame: pd.concat([frame, frame]), id="twice"),
+            pytest.param(
+                lambda frame: frame.set_geometry([Polygon([(-5, -9), (45, 9), (45, -9), (-5, 9)])] * 5), id="a bow"
+            ),
+        ],
+    )
+    def test_tell_what_nobody_else_saw(self, change):
+        assert self.left_out(change) == {5}
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            pytest.param(lambda frame: frame.iloc[:4], id="one is missing"),
+            pytest.param(lambda frame: frame.set_geometry([None, *frame.geometry[1:]]), id="one has none"),
+            pytest.param(lambda frame: frame.set_geometry([Polygon(), *frame.geometry[1:]]), id="one is empty"),
+            pytest.param(lambda frame: frame.assign(drive="b"), id="of another drive"),
+        ],
+    )
+    def test_that_are_not_all_known_tell_nothing(self, change):
+        assert self.left_out(change) == set()
+
+    def test_without_names_are_refused(self):
+        with pytest.raises(pm.SchemaError, match="'drive': its instances have no column 'instance'"):
+            self.left_out(lambda frame: frame.drop(columns="instance"))
+
+    def test_without_a_crs_are_in_the_layers(self):
+        layer = looks(*(level(0.05 * n) for n in range(5)), level(6.0), instance=[0, 1, 2, 3, 4, 2])
+        maps = local_maps(layer, [self.AREA] * 5)
+        moved = [frame.set_geometry(frame.translate(4e5, 6e6)) for frame in (maps.observations, maps.instances)]
+        away = pm.LocalMaps(moved[0].set_crs("EPSG:32632"), moved[1].assign(x=4e5 + 20, y=6e6), source="drive")
+        elsewhere = looks(level(0), crs="EPSG:25832")
+        elsewhere = elsewhere.set_geometry(elsewhere.translate(4e5, 6e6 + 50)).assign(drive="main")
+        main = elsewhere.to_crs("EPSG:3857").assign(element_id=1)
+        assert len(merge(away, main_map=main, crs=None).left_out) == 1
 
 
 def test_a_crossing_cut_off_at_the_edge_of_what_was_looked_at_joins_the_whole_one():

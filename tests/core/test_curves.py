@@ -19,6 +19,16 @@ def test_a_stretch_that_ends_at_a_vertex_but_for_rounding_has_it_once(off):
     assert steps.min() > 1
 
 
+def test_what_lies_beyond_an_end_falls_exactly_onto_it():
+    # Lengths are sums over all lines before, so that they differ from each line's own by rounding.
+    rng = np.random.default_rng(1)
+    lines = shapely.linestrings(rng.uniform(0, 1e3, (200, 7, 2)))
+    curves, every = Curves(lines), np.arange(200)
+    for end, position in ((0, np.zeros(200)), (-1, curves.length)):
+        ends = shapely.get_coordinates(shapely.get_point(lines, end))
+        assert curves.locate(every, ends).tolist() == position.tolist()
+
+
 def test_distinct_values_rise():
     assert distinct(np.array([3, 1, 3, 2, 1])).tolist() == [1, 2, 3]
     assert distinct(np.array([], dtype=np.intp)).tolist() == []

@@ -9,6 +9,9 @@ import pytest
 from shapely import LineString
 
 from polymerge_core import OptionError, merge
+from tests.core.methods import every_method
+
+pytestmark = every_method
 
 BIG = 2**53 + 1
 
@@ -163,8 +166,10 @@ class TestColumnsOfSeveralLayers:
         assert result.elements["n_observations"].tolist() == [2]
         assert "Sigma_M" not in result.elements
 
-    def test_that_were_understood_are_not_carried(self):
+    def test_that_were_understood_are_not_carried(self, method):
         elements = self.both({"score": [0.5], "timestamp": [1]}, {"score": [0.7], "timestamp": [2]}).elements
         assert list(elements) == [
-            *("element_id", "class", "score", "n_observations", "n_instances", "length_m", "geometry")
+            *("element_id", "class", "score", "n_observations", "n_instances", "length_m"),
+            *(["sigma_m"] if method == "consensus" else []),
+            "geometry",
         ]

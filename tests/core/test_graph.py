@@ -56,8 +56,8 @@ class TestMergeNetwork:
             assert len({graph.nodes[member]["component"] for member in members}) == 1
         assert len({number for _, number in graph.nodes(data="component")}) == 3
 
-    def test_components_are_the_elements_of_the_merge(self, looks, graph):
-        lineage = merge(looks, crs="local", instance_field="frame").lineage
+    def test_components_are_the_elements_of_the_published_method(self, looks, graph):
+        lineage = merge(looks, crs="local", instance_field="frame", method="polymerge").lineage
         merged = {frozenset(fids) for fids in lineage.groupby("element_id")["source_fid"].agg(list)}
         fid = dict(graph.nodes(data="source_fid"))
         assert {frozenset(fid[node] for node in members) for members in nx.connected_components(graph)} == merged

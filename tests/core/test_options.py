@@ -14,7 +14,7 @@ class TestDefaults:
     def test_are_those_of_the_table(self):
         options = Options.of()
         assert (options.proximity, options.coverage, options.min_score) == (1.0, 0.5, 0.0)
-        assert (options.method, options.class_name, options.aggregate) == ("polymerge", "line", "first")
+        assert (options.method, options.class_name, options.aggregate) == ("consensus", "line", "first")
         assert options.area == {"ped_crossing"}
         fields = ("class_field", "drive_field", "instance_field", "instance_from", "score_field", "timestamp_field")
         assert [getattr(options, name) for name in (*fields, "crs", "out_crs")] == [None] * 8

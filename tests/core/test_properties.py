@@ -20,6 +20,9 @@ from pandas.testing import assert_frame_equal
 
 from polymerge_core import LocalMaps, merge
 from polymerge_core.observations import MIN_SEGMENT_M
+from tests.core.methods import consensus, every_method, published
+
+pytestmark = every_method
 
 CLASSES = ("divider", "boundary", "ped_crossing", "kerb")
 UTM, DEGREES = "EPSG:32632", "EPSG:4326"
@@ -238,7 +241,8 @@ from polymerge_core import merge
 from tests.core.test_properties import random_maps
 digest = hashlib.sha256()
 for seed in (1, 2, 3):
-    elements = merge(random_maps(seed), random_maps(seed + 9, instances=1), crs="local", aggregate="mode").elements
+    into = random_maps(seed + 9, instances=1)
+    elements = merge(random_maps(seed), into, crs="local", aggregate="mode", method=sys.argv[1]).elements
     for row in elements.drop(columns="geometry").itertuples(index=False):
         digest.update(repr(row).encode())
     digest.update(b"".join(elements.geometry.to_wkb()))
@@ -246,12 +250,11 @@ sys.stdout.write(digest.hexdigest())
 """
 
 
-def test_hash_seed_does_not_matter():
+def test_hash_seed_does_not_matter(method):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    program = [sys.executable, "-c", HASH, method]
     runs = [
-        subprocess.Popen(
-            [sys.executable, "-c", HASH], env=environment | {"PYTHONHASHSEED": seed}, stdout=subprocess.PIPE, text=True
-        )
+        subprocess.Popen(program, env=environment | {"PYTHONHASHSEED": seed}, stdout=subprocess.PIPE, text=True)
         for seed in "0123"
     ]
     found = [run.communicate(timeout=300)[0] for run in runs]
@@ -336,6 +339,7 @@ class TestIdentity:
         columns = ["element_id", "class", "score", "lanes"]
         assert_frame_equal(pd.DataFrame(result[columns]), pd.DataFrame(by_id[columns]))
 
+    @published
     @some(8)
     @given(seeds, st.sampled_from([1, -1]))
     def test_of_lines_twice_the_proximity_apart_merged_with_their_copy(self, seed, direction):
@@ -351,10 +355,29 @@ class TestIdentity:
         elements = merge(both, crs="local").elements
         assert sorted(wkb_of(elements)) == sorted(wkb_of(layer))
 
-    def test_of_parallel_lines_exactly_twice_the_proximity_apart_merged_with_their_copy(self):
+    @consensus
+    @some(8)
+    @given(seeds, st.sampled_from([1, -1]))
+    def test_of_gently_bent_lines_merged_with_their_copy_but_for_a_quarter_of_the_proximity(self, seed, direction):
+        rng = np.random.default_rng(seed)
+        rows = [road(rng) for _ in range(8)]
+        lines = [shapely.LineString(points - points.min(axis=0) + (0, 60 * k)) for k, points in enumerate(rows)]
+        layer = gpd.GeoDataFrame({"element_id": range(1, 9)}, geometry=lines)
+        copy = layer[["geometry"]].copy()
+        copy["geometry"] = [line if direction == 1 else line.reverse() for line in lines]
+        elements = merge(copy, layer, crs="local").elements
+        assert elements["element_id"].tolist() == layer["element_id"].tolist()
+        assert elements["n_observations"].tolist() == [2] * 8
+        assert shapely.hausdorff_distance(elements.geometry, layer.geometry).max() < 0.25
+
+    def test_of_parallel_lines_exactly_twice_the_proximity_apart_merged_with_their_copy(self, method):
         lines = [shapely.LineString([(0, 2.0 * k), (7, 2.0 * k), (15, 2.0 * k)]) for k in range(5)]
         layer = gpd.GeoDataFrame({"element_id": range(5)}, geometry=lines)
-        assert wkb_of(merge(layer[["geometry"]], layer, crs="local").elements) == wkb_of(layer)
+        elements = merge(layer[["geometry"]], layer, crs="local").elements
+        assert elements["element_id"].tolist() == layer["element_id"].tolist()
+        distance = shapely.hausdorff_distance(elements.geometry, layer.geometry)
+        assert distance.max() < 1e-9
+        assert method == "consensus" or wkb_of(elements) == wkb_of(layer)
 
     @some(6)
     @given(seeds)

@@ -15,6 +15,9 @@ from polymerge_core import (
     read_local_maps,
     write_layers,
 )
+from tests.core.methods import every_method, published
+
+pytestmark = every_method
 
 UTM = "EPSG:32632"
 
@@ -54,6 +57,7 @@ def test_a_layer_without_the_class_column_that_others_have_is_told():
     assert "class_name" in warning
 
 
+@published
 def test_polygons_that_became_rectangles_are_told():
     parks = layer(box(0, 0, 90, 50), box(0.4, 0.4, 90, 50))
     (warning,) = warnings_of(parks)
