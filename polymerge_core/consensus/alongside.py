@@ -135,7 +135,7 @@ def _measured(looks: Looks, drawn: Axes, short: Index, long: Index) -> Pairs:
     sample = (2 * np.where(back, counts[pair] - 1 - number, number) + 1) * points[pair] // (2 * counts[pair])
     at = drawn.first[mine] + np.where(back, points[pair] - 1 - sample, sample)
     place, position = drawn.stations[at], looks.arc[at]
-    feet = drawn.feet(place, theirs, unit, _beginning(drawn, place, theirs, number))
+    feet = drawn.feet(place, theirs, unit, _beside(drawn, at, theirs, number))
     foot = looks.arc[feet.station] + feet.ahead
     cosine = dot(looks.tangent[at], feet.tangent)
     last = drawn.first + drawn.counts - 1
@@ -166,21 +166,35 @@ def _measured(looks: Looks, drawn: Axes, short: Index, long: Index) -> Pairs:
     return found.take(found.overlap + found.apart >= np.minimum(2 * unit, 0.5 * curves.length[short]))
 
 
-def _beginning(drawn: Axes, points: Array, line: Index, number: Index) -> Index:
-    """Return a station of its line near each point: of the points 0, 1, ... of a look each leads to the next."""
-    found = np.empty(len(points), np.intp)
+def _beside(drawn: Axes, at: Index, line: Index, number: Index) -> Index:
+    """Return the station of another line that each station is nearest to: those of one look lead from each to the next.
+
+    Parameters
+    ----------
+    drawn : Axes
+        The looks.
+    at : ndarray of int, shape (k,)
+        Stations, those of one look and one other line after each other.
+    line : ndarray of int, shape (k,)
+        The other line.
+    number : ndarray of int, shape (k,)
+        0 for the first of each look, then 1, 2, ...
+    """
+    points, first, last = drawn.stations[at], drawn.first[line], (drawn.first + drawn.counts - 1)[line]
+    found = np.empty(len(at), np.intp)
     rows = np.flatnonzero(number == 0)
-    some, sample = count_up(drawn.counts[line[rows]] // _COARSE + 1)
-    station = drawn.first[line[rows]][some] + sample * _COARSE
-    station = np.minimum(station, (drawn.first + drawn.counts - 1)[line[rows]][some])
-    distance = ((drawn.stations[station] - points[rows][some]) ** 2).sum(axis=1)
-    found[rows] = station[best_of_each(some, -distance, station)]
+    some, sample = count_up((last - first)[rows] // _COARSE + 1)
+    tried = np.minimum(first[rows[some]] + sample * _COARSE, last[rows[some]])
     while len(rows):
-        found[rows] = drawn.walked(points[rows], found[rows])
-        after = rows[rows + 1 < len(number)] + 1
-        after = after[number[after] > 0]
-        found[after] = found[after - 1]
-        rows = after
+        away = ((drawn.stations[tried] - points[rows[some]]) ** 2).sum(axis=1)
+        found[rows] = drawn.walked(points[rows], tried[best_of_each(some, -away, tried)])
+        rows = rows[rows + 1 < len(number)] + 1
+        rows = rows[number[rows] > 0]
+        # The next one is as far on, in either direction. From here one would not walk past a sharp corner.
+        step = at[rows] - at[rows - 1]
+        tried = np.concatenate([found[rows - 1] + way * step for way in (-1, 0, 1)])
+        some = np.tile(np.arange(len(rows)), 3)
+        tried = np.clip(tried, first[rows[some]], last[rows[some]])
     return found
 
 

@@ -20,6 +20,9 @@ from polymerge_core.network import Edges, breadth_first_depth, components
 #: Weight of a look's own zero against that of its pairs: enough to make the equations solvable, too little to matter.
 _ANCHOR = 1e-6
 
+#: Proximities by which steps along a line may be longer than one, all of them together.
+_TRIFLE = 0.01
+
 #: The least squares are solved (conjugate gradients) to this share of what the spanning tree leaves, in so many steps.
 _EXACT, _STEPS = 1e-6, 100
 
@@ -51,9 +54,10 @@ def first_axes(looks: Looks, pairs: Pairs, group: Index, weight: Array) -> Axes:
     low, high = np.full(count, np.inf), np.full(count, -np.inf)
     np.minimum.at(low, of_point, position)
     np.maximum.at(high, of_point, position)
-    # Equal steps of at most one proximity from end to end, so that both ends are alike.
+    # Equal steps from end to end, so that both ends are alike; of one proximity, or little more, so that a line that
+    # grew by a trifle is not cut into other steps than its looks.
     extent = np.maximum(high - low, np.finfo(float).tiny)
-    steps = np.maximum(np.ceil(extent - 1e-9), 1).astype(np.intp)
+    steps = np.maximum(np.ceil(extent - _TRIFLE), 1).astype(np.intp)
     place = np.round((position - low[of_point]) / extent[of_point] * steps[of_point]).astype(np.intp)
     sizes = steps + 1
     station = (np.cumsum(sizes) - sizes)[of_point] + place

@@ -41,7 +41,9 @@ class _Touches(NamedTuple):
     instance: Index
 
 
-def met(shapes: NDArray[np.object_], looks: list[Looks], element: list[Index]) -> NDArray[np.object_]:
+def met(
+    shapes: NDArray[np.object_], looks: list[Looks], element: list[Index], alone: NDArray[np.bool_]
+) -> NDArray[np.object_]:
     """Draw the ends of merged lines to what they meet.
 
     Parameters
@@ -52,6 +54,8 @@ def met(shapes: NDArray[np.object_], looks: list[Looks], element: list[Index]) -
         Of each class.
     element : list of ndarray of int, shape (p,)
         The merged line that each point of the looks went into, -1 for none.
+    alone : ndarray of bool, shape (m,)
+        Which lines are one look, as it is: two of them meet as they do, or do not.
 
     Returns
     -------
@@ -60,7 +64,7 @@ def met(shapes: NDArray[np.object_], looks: list[Looks], element: list[Index]) -
     if len(shapes) == 0:
         return shapes
     unit = looks[0].unit
-    touches = _touches(shapes, looks, element, unit)
+    touches = _touches(shapes, looks, element, alone, unit)
     if len(touches.end) == 0:
         return shapes
     # Ends that touch ends are one place.
@@ -89,7 +93,9 @@ def met(shapes: NDArray[np.object_], looks: list[Looks], element: list[Index]) -
     return _with_vertices(shapes, onto, feet)
 
 
-def _touches(shapes: NDArray[np.object_], looks: list[Looks], element: list[Index], unit: float) -> _Touches:
+def _touches(
+    shapes: NDArray[np.object_], looks: list[Looks], element: list[Index], alone: NDArray[np.bool_], unit: float
+) -> _Touches:
     curves = [each.curves for each in looks]
     lines = np.concatenate([each.lines for each in curves])
     closed = np.concatenate([each.closed for each in curves])
@@ -115,6 +121,7 @@ def _touches(shapes: NDArray[np.object_], looks: list[Looks], element: list[Inde
     at_end = ~closed[other] & (np.minimum(along, length - along) <= _TOUCH * unit)
     far = _nearest_end(shapes, np.where(at_end, line, -1), there[tip], unit)
     kept = (line >= 0) & (line != own[tip]) & (seen_end[tip] >= 0)
+    kept &= ~(alone[np.maximum(own[tip], 0)] & alone[np.maximum(line, 0)])
     kept &= shapely.dwithin(there[tip], shapes[np.maximum(line, 0)], REACH * unit)
     tip, line, far = tip[kept], line[kept], far[kept]
     touches = _Touches(seen_end[tip], line, far, instance[look[tip]])

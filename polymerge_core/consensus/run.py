@@ -110,13 +110,14 @@ def merge_by_consensus(
     advance(1.0)
     moved = corrections[np.arange(len(corrections)) != given.instances.known]
     merged, used = _put_together(observations, found, _joined(pieces), moved)
-    return replace(merged, shapes=_meeting(merged.shapes, used, lines, looks, corrections))
+    return replace(merged, shapes=_meeting(merged, used, lines, looks, corrections))
 
 
 def _meeting(
-    shapes: NDArray[np.object_], used: Index, lines: list[Lines], looks: list[Looks], corrections: Array
+    merged: Consensus, used: Index, lines: list[Lines], looks: list[Looks], corrections: Array
 ) -> NDArray[np.object_]:
-    """Draw the lines of all classes to what they meet; they come before the areas."""
+    """Return the shapes, the lines of all classes drawn to what they meet; they come before the areas."""
+    shapes = merged.shapes
     first = np.cumsum([0, *(len(each.shapes) for each in lines)])
     count = int(np.searchsorted(used, first[-1]))
     if count == 0:
@@ -128,9 +129,10 @@ def _meeting(
         number[np.where(each.element < 0, -1, each.element + start)]
         for each, start in zip(lines, first[:-1], strict=True)
     ]
+    alone = np.diff(merged.sets.bounds) == 1
     centre = centres(looks, len(corrections))
     moved = [corrected(each, corrections, centre) for each in looks]
-    return np.concatenate([met(shapes[:count], moved, element), shapes[count:]])
+    return np.concatenate([met(shapes[:count], moved, element, alone[:count]), shapes[count:]])
 
 
 def _pieces_of_lines(rows: Index, lines: Lines, looks: Looks, first: int, shortest: float) -> _Pieces:
