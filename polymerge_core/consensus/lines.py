@@ -116,11 +116,13 @@ def _finish(state: State) -> Lines:
 def _at_least_by_their_own(looks: Looks, fit: Fit, found: Support) -> Support:
     """Count each place as seen by those who say that it is there, also where smoothing took it out of their reach.
 
-    A line that nobody missed is whole: nothing may be left out of it.
+    A line that nobody missed is whole: nothing may be left out of it. Of others only what nobody could miss, and what was
+    known before, counts so: where footprints tell who looked, what smoothing leaves behind is no evidence.
     """
     axes, past = fit.axes, np.nan_to_num(looks.past, nan=1.0)
     whole = np.bincount(axes.line, found.expected > found.seen)[axes.line] == 0
     least = {name: whole.astype(np.float64) for name in ("seen", "seen_drives")}
+    told = np.isfinite(looks.knowledge) | (looks.instances.footprint is None)
     for name, seen in least.items():
-        np.maximum.at(seen, fit.feet.station, past[:, PAST.index(name)])
+        np.maximum.at(seen, fit.feet.station[told], past[told, PAST.index(name)])
     return found._replace(**{name: np.maximum(getattr(found, name), seen) for name, seen in least.items()})
