@@ -21,6 +21,12 @@ _SAME = 1e-9
 #: Nearer than this to an end of a line is at the end, metres.
 _END = 1e-6
 
+#: So many points are projected in a fraction of a second, also onto lines of thousands of vertices.
+_AT_ONCE = 20_000
+
+#: Of so many lines the neighbours are found in a fraction of a second, also where thousands lie at one place.
+_LINES_AT_ONCE = 50
+
 
 class Pieces(NamedTuple):
     """Lines cut into pieces of even length, one entry a piece, line by line."""
@@ -103,11 +109,26 @@ class Curves:
 
         What falls onto an end is exactly at it: 0, or the length.
         """
-        found: Array = shapely.line_locate_point(self.lines[line], shapely.points(points))
+        found = np.empty(len(line))
+        # By parts: an interrupt is not heard before shapely returns.
+        for first in range(0, len(line), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            found[part] = shapely.line_locate_point(self.lines[line[part]], shapely.points(points[part]))
         length = self.length[line]
         # Both lengths are sums, which round differently.
         found = np.where(found > length - _END, length, found)
         return np.where(found < _END, 0.0, found)
+
+    def within(self, distance: float) -> tuple[Index, Index]:
+        """Return both lines of each pair that comes nearer to each other than a distance, each pair once."""
+        tree, found = shapely.STRtree(self.lines), []
+        for first in range(0, len(self), _LINES_AT_ONCE):
+            part = self.lines[first : first + _LINES_AT_ONCE]
+            one, other = tree.query(part, predicate="dwithin", distance=distance)
+            once = one + first < other
+            found.append((one[once] + first, other[once]))
+        pairs = [np.concatenate(column) for column in zip(*found, strict=True)] or [np.empty(0, np.intp)] * 2
+        return pairs[0], pairs[1]
 
     def pieces(self, step: float) -> Pieces:
         """Cut every line into equal pieces of at most `step` metres."""

@@ -65,9 +65,9 @@ def pairs_alongside(looks: Looks, kind: Index) -> Pairs:
         Those that run beside each other over two proximities, or over half of the shorter one.
     """
     curves, unit = looks.curves, looks.unit
-    first, second = shapely.STRtree(curves.lines).query(curves.lines, predicate="dwithin", distance=2 * REACH * unit)
-    once = (first < second) & (kind[first] == kind[second])
-    first, second = first[once], second[once]
+    first, second = curves.within(2 * REACH * unit)
+    alike = kind[first] == kind[second]
+    first, second = first[alike], second[alike]
     shorter = curves.length[first] <= curves.length[second]
     short, long = np.where(shorter, first, second), np.where(shorter, second, first)
     counts = np.clip(np.ceil(curves.length[short] / (2 * unit)), 2, _STATIONS).astype(np.intp)

@@ -80,9 +80,16 @@ def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tup
         return [], np.zeros((0, 3)), no_drift()
     instances, unit = classes[0].instances, classes[0].unit
     states = []
-    for number, looks in enumerate(classes):
-        states.append(trace(looks, instances.drive[looks.instance]))
-        advance(0.6 * (number + 1) / len(classes))
+    done, every = 0, max(1, sum(len(looks.points) for looks in classes))
+    for looks in classes:
+        points = len(looks.points)
+
+        def part(share: float, done: int = done, points: int = points) -> None:
+            advance(0.6 * (done + share * points) / every)
+
+        states.append(trace(looks, instances.drive[looks.instance], part))
+        done += points
+    advance(0.6)
     centre = centres(classes, len(instances))
     shifted, corrected = np.zeros((len(centre), 3)), np.zeros((len(centre), 3))
     drift = no_drift()

@@ -29,6 +29,15 @@ def test_what_lies_beyond_an_end_falls_exactly_onto_it():
         assert curves.locate(every, ends).tolist() == position.tolist()
 
 
+def test_pairs_within_a_distance_are_each_found_once():
+    rng = np.random.default_rng(2)
+    lines = shapely.linestrings(rng.uniform(0, 60, (130, 1, 2)) + rng.normal(0, 2, (130, 4, 2)))
+    first, second = Curves(lines).within(3.0)
+    near = shapely.distance(lines[:, None], lines[None]) <= 3.0
+    assert sorted(zip(first, second, strict=True)) == list(zip(*np.nonzero(np.triu(near, 1)), strict=True))
+    assert [len(found) for found in Curves(lines[:0]).within(3.0)] == [0, 0]
+
+
 def test_distinct_values_rise():
     assert distinct(np.array([3, 1, 3, 2, 1])).tolist() == [1, 2, 3]
     assert distinct(np.array([], dtype=np.intp)).tolist() == []
