@@ -62,7 +62,9 @@ _reading_options = _decorate(
     click.option("--score-field", help="Column of the confidence, 0 to 1.  [default: score, else 1]"),
     click.option("--min-score", type=float, default=0.0, show_default=True, help="Leave out what is under it."),
     click.option("--timestamp-field", help="Column that orders the local maps.  [default: timestamp, if any]"),
-    click.option("--proximity", type=float, default=1.0, show_default=True, help="Th_prox in metres."),
+    click.option(
+        "--proximity", type=float, default=1.0, show_default=True, help="How near is near, in metres (Th_prox)."
+    ),
     click.option("--area", multiple=True, metavar="CLASS", help="A class of areas, beside ped_crossing; repeatable."),
     click.option("--crs", callback=_known_crs, help="CRS of layers without one, such as EPSG:32632, or local."),
     click.option(
@@ -129,8 +131,20 @@ def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None
 @cli.command()
 @click.argument("local_maps", nargs=-1, required=True, metavar="LOCAL...")
 @_reading_options
-@click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True)
-@click.option("--coverage", type=float, default=0.5, show_default=True, help="Th_cov, for area classes.")
+@click.option(
+    "--method",
+    type=click.Choice(METHODS),
+    default=METHODS[0],
+    show_default=True,
+    help="consensus: one robust line from all looks at it; polymerge: as it was published.",
+)
+@click.option(
+    "--coverage",
+    type=float,
+    default=0.5,
+    show_default=True,
+    help="Of polymerge, for area classes: the share of areas that must cover a place (Th_cov).",
+)
 @click.option(
     "--aggregate",
     multiple=True,
@@ -169,7 +183,7 @@ def merge(local_maps: tuple[str, ...], output: Path, main_map: str | None, **cho
 @_output
 @_run_options
 def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **chosen: Any) -> None:
-    """Write who would be merged with whom: layers edges and observations."""
+    """Write who would be merged with whom by --method polymerge: layers edges and observations."""
     run = split_off(chosen)
     Options.of(**chosen)
     inputs = [*local_maps, *([] if main_map is None else [main_map])]

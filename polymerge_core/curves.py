@@ -21,6 +21,9 @@ _SAME = 1e-9
 #: Nearer than this to an end of a line is at the end, metres.
 _END = 1e-6
 
+#: So many points are projected in a fraction of a second, also onto lines of thousands of vertices.
+_AT_ONCE = 20_000
+
 
 class Pieces(NamedTuple):
     """Lines cut into pieces of even length, one entry a piece, line by line."""
@@ -103,7 +106,11 @@ class Curves:
 
         What falls onto an end is exactly at it: 0, or the length.
         """
-        found: Array = shapely.line_locate_point(self.lines[line], shapely.points(points))
+        found = np.empty(len(line))
+        # By parts: an interrupt is not heard before shapely returns.
+        for first in range(0, len(line), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            found[part] = shapely.line_locate_point(self.lines[line[part]], shapely.points(points[part]))
         length = self.length[line]
         # Both lengths are sums, which round differently.
         found = np.where(found > length - _END, length, found)

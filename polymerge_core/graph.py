@@ -22,7 +22,9 @@ def merge_network(
     progress: Progress | None = None,
     **options: Any,
 ) -> nx.Graph:
-    """Find which observations are to be merged with each other (paper, Alg. 1).
+    """Find which observations the published method merges with each other (paper, Alg. 1).
+
+    The consensus has no such network: it does not merge all that hangs together (`merge`).
 
     Parameters
     ----------
@@ -31,7 +33,7 @@ def merge_network(
     progress : callable, optional
         Called with the fraction done and a message; may raise to stop the work.
     **options
-        `proximity`, the columns and the CRS, as in `merge`.
+        `proximity` (Th_prox), the columns and the CRS, as in `merge`.
 
     Returns
     -------

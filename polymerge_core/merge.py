@@ -1,8 +1,9 @@
-"""The published method from layers to a map: network, then one element from each connected component.
+"""From layers to a map, by either method: the consensus, or the method as it was published.
 
-The order of the steps is the paper's (section II-B): concatenate the local maps and the main map, find who is
-to be merged with whom, class by class, and merge each connected set under its class. Every observation
-ends in an element (table `lineage`) or among those left out (table `left_out`).
+The consensus finds the lines that all looks show together (`polymerge_core.consensus`). The order of the steps of the
+published method is the paper's (section II-B): concatenate the local maps and the main map, find who is to be merged
+with whom, class by class, and merge each connected set under its class. Every observation ends in an element (table
+`lineage`) or among those left out (table `left_out`).
 """
 
 from __future__ import annotations
@@ -43,8 +44,9 @@ class MergeResult:
     Parameters
     ----------
     elements : GeoDataFrame
-        The merged map: `element_id`, `class`, `score`, `n_observations`, `n_instances`, `length_m`, the user's columns,
-        geometry in the type in which it came, in the output CRS; ordered by `element_id`.
+        The merged map: `element_id`, `class`, `score`, `n_observations`, `n_instances`, `length_m`, in "consensus"
+        `sigma_m` (median standard error, metres; NaN where nothing is known of it), the user's columns, geometry in
+        the type in which it came, in the output CRS; ordered by `element_id`.
     lineage : DataFrame
         Which interval (metres along the source feature) of which observation went into which element.
     left_out : DataFrame
@@ -113,7 +115,7 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
         Lines or polygons in any CRS; one observation a row. The inputs are not changed.
     main_map : GeoDataFrame, LocalMaps, or sequence of them, optional
         The map to merge into; its `element_id` are kept. Lines and areas may come as two
-        layers. Without one, the first instance plays its part.
+        layers. In "polymerge", without one, the first instance plays its part.
     class_field : str, optional
         Column of the class, `class` by default. Only observations of one class are merged.
     class_name : str, default "line"
@@ -129,18 +131,21 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
         Observations under it are left out (the paper uses 0.8).
     timestamp_field : str, optional
         Column that orders the instances, `timestamp` by default: dates with times, or integer nanoseconds.
-    method : {"polymerge", "consensus"}, default "polymerge"
-        How observations become elements: "polymerge" as published, "consensus" one smooth line from all looks at it.
+    method : {"consensus", "polymerge"}, default "consensus"
+        How observations become elements: "consensus" one smooth line from all looks at it, robustly averaged;
+        "polymerge" as published.
     proximity : float, default 1.0
-        Th_prox, metres: polylines with a vertex nearer than this to each other are merged.
+        Metres. In "consensus" the scale of all lengths: looks that run alongside each other no farther apart than this
+        are of one line. In "polymerge" Th_prox: polylines with a vertex nearer than this to each other are merged.
     coverage : float, default 0.5
-        Th_cov, for area classes: the share of areas that must cover a place.
+        Of "polymerge" alone, Th_cov, for area classes: the share of areas that must cover a place.
     area : str or sequence of str, optional
         Classes that are areas, beside `ped_crossing`. Polygons of other classes are areas too, but for those of
         the classes `divider` and `boundary`.
     aggregate : str or mapping, default "first"
-        How the user's columns are carried: `first` (the base observation's), `mode`, `mean`, `min`, `max` or
-        `sum`; one for all columns, or by column name.
+        How the user's columns are carried: `first` (the base observation's: the main map's, else the longest one of
+        "consensus", the longest one of the earliest instance of "polymerge"), `mode`, `mean`, `min`, `max` or `sum`;
+        one for all columns, or by column name.
     crs : any, optional
         CRS of layers without one, or "local" for plain metric coordinates.
     out_crs : any, optional
@@ -165,14 +170,17 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
     References
     ----------
     Sayed, Perminov, Tsetserukou, "PolyMerge: A Novel Technique aimed at Dynamic HD Map Updates Leveraging
-    Polylines", section II-B.
+    Polylines", section II-B, for "polymerge"; the modules of `polymerge_core.consensus` name theirs.
 
     Examples
     --------
     >>> import geopandas as gpd
     >>> from shapely import LineString
+    >>> looks = gpd.GeoSeries([LineString([(5, y), (14, y)]) for y in (0.0, 0.1, 0.2)])
+    >>> merge(looks, crs="local").elements.geometry.to_wkt(rounding_precision=1).tolist()
+    ['LINESTRING (5 0.1, 14 0.1)']
     >>> looks = gpd.GeoSeries([LineString([(0, 0), (9, 0)]), LineString([(1, 0.5), (8, -0.5)])])
-    >>> merge(looks, crs="local").elements.geometry.to_wkt().tolist()
+    >>> merge(looks, crs="local", method="polymerge").elements.geometry.to_wkt().tolist()
     ['LINESTRING (0 0, 1 0.25, 8 -0.25, 9 0)']
     """
     options = Options.of(

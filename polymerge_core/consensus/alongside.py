@@ -99,7 +99,9 @@ def _near(looks: Looks, kind: Index) -> tuple[Index, Index]:
     some = [_some(looks, rows, tree.query(around[rows])) for rows in blocks]
     pairs = distinct(np.concatenate(some))
     first, second = pairs // max(len(lines), 1), pairs % max(len(lines), 1)
-    near = shapely.dwithin(lines[first], lines[second], distance)
+    # By parts: an interrupt is not heard before shapely returns.
+    parts = np.array_split(np.arange(len(pairs)), 1 + len(pairs) // _BLOCK)
+    near = np.concatenate([shapely.dwithin(lines[first[rows]], lines[second[rows]], distance) for rows in parts])
     return first[near], second[near]
 
 

@@ -80,9 +80,16 @@ def merge_lines(classes: list[Looks], advance: Callable[[float], object]) -> tup
         return [], np.zeros((0, 3)), no_drift()
     instances, unit = classes[0].instances, classes[0].unit
     states = []
-    for number, looks in enumerate(classes):
-        states.append(trace(looks, instances.drive[looks.instance]))
-        advance(0.6 * (number + 1) / len(classes))
+    done, every = 0, max(1, sum(len(looks.points) for looks in classes))
+    for looks in classes:
+        points = len(looks.points)
+
+        def part(share: float, done: int = done, points: int = points) -> None:
+            advance(0.6 * (done + share * points) / every)
+
+        states.append(trace(looks, instances.drive[looks.instance], part))
+        done += points
+    advance(0.6)
     centre = centres(classes, len(instances))
     shifted, corrected = np.zeros((len(centre), 3)), np.zeros((len(centre), 3))
     drift = no_drift()
@@ -116,8 +123,8 @@ def _finish(state: State) -> Lines:
 def _at_least_by_their_own(looks: Looks, fit: Fit, found: Support) -> Support:
     """Count each place as seen by those who say that it is there, also where smoothing took it out of their reach.
 
-    A line that nobody missed is whole: nothing may be left out of it. Of others only what nobody could miss, and what was
-    known before, counts so: where footprints tell who looked, what smoothing leaves behind is no evidence.
+    A line that nobody missed is whole: nothing may be left out of it. Of others only what nobody could miss, and what
+    was known before, counts so: where footprints tell who looked, what smoothing leaves behind is no evidence.
     """
     axes, past = fit.axes, np.nan_to_num(looks.past, nan=1.0)
     whole = np.bincount(axes.line, found.expected > found.seen)[axes.line] == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ class State(NamedTuple):
     fit: Fit
 
 
-def trace(looks: Looks, kind: Index) -> State:
+def trace(looks: Looks, kind: Index, advance: Callable[[float], object] = lambda _share: None) -> State:
     """Find the lines that looks show.
 
     Parameters
@@ -40,16 +41,22 @@ def trace(looks: Looks, kind: Index) -> State:
         Of one class.
     kind : ndarray of int, shape (n,)
         Only looks of one kind can show the same line.
+    advance : callable, optional
+        Called with the share done.
 
     Returns
     -------
     State
         The line of each look, and the lines.
     """
+    advance(0.0)
     pairs = pairs_alongside(looks, kind)
+    advance(0.2)
     group = _connected(looks, pairs, associate(looks, pairs))
+    advance(0.5)
     state = _begin(looks, pairs, group, Noise.unknown(looks))
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
+        advance(0.6 + 0.4 * number / _ROUNDS)
         group = _connected(looks, pairs, settle(looks, state.group, state.fit, kind))
         if np.array_equal(group, state.group):
             break

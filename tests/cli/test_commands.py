@@ -13,6 +13,7 @@ import shapely
 from shapely import LineString
 
 import polymerge_core
+from polymerge_core.options import METHODS
 from tests.cli.layers import EAST, NORTH, UTM, area, coordinates, draw, line, look, noisy_copies
 
 COMMANDS = ("project", "merge", "network", "demo", "env")
@@ -65,15 +66,20 @@ def test_ten_copies_in_one_shapefile_give_one_line(run, tmp_path):
     assert shapely.hausdorff_distance(road.geometry[0], truth) < 1.0
 
 
-def test_ten_shapefiles_with_one_copy_each_give_the_same_line(run, tmp_path):
+@pytest.mark.parametrize("method", METHODS)
+def test_ten_shapefiles_with_one_copy_each_give_the_same_line(run, tmp_path, method):
     copies = noisy_copies(10, 20)
     one = draw(tmp_path / "track.shp", copies)
     # Names in another order than the copies: nothing may depend on it.
     each = [draw(tmp_path / f"walk_{7 * n % 10}.shp", copies[n : n + 1], id=[n]) for n in range(10)]
-    assert run("merge", one, "-o", tmp_path / "one.gpkg").code == 0
-    assert run("merge", *each, "-o", tmp_path / "each.gpkg").code == 0
+    assert run("merge", one, "--method", method, "-o", tmp_path / "one.gpkg").code == 0
+    assert run("merge", *each, "--method", method, "-o", tmp_path / "each.gpkg").code == 0
     single, many = look(tmp_path / "one.gpkg", "elements"), look(tmp_path / "each.gpkg", "elements")
-    assert coordinates(many) == coordinates(single)
+    if method == "polymerge":
+        assert coordinates(many) == coordinates(single)
+    # The consensus takes what came in files of their own for drives, each of which has an error of its own.
+    along = shapely.line_interpolate_point(single.geometry[0], np.linspace(0, 1, 100), normalized=True)
+    assert np.quantile(shapely.distance(along, many.geometry[0]), 0.95) < 0.05
     assert many["n_observations"].tolist() == [10]
     assert sorted(look(tmp_path / "each.gpkg", "lineage")["source"]) == [f"walk_{n}" for n in range(10)]
 
@@ -141,7 +147,7 @@ def test_a_main_map_keeps_its_ids_and_tells_which_became_others(run, tmp_path):
         element_id=[7, 3, 5],
         name=["west", "east", "alone"],
     )
-    bridge = draw(tmp_path / "new.gpkg", [line((8, 0.5), (22, 0.5)), line((0, 40), (9, 40))])
+    bridge = draw(tmp_path / "new.gpkg", [line((5, 0.5), (25, 0.5)), line((0, 40), (9, 40))])
     outcome = run("merge", bridge, "--main-map", main_map, "-o", tmp_path / "out.gpkg")
     assert outcome.code == 0, outcome.err
     elements = look(tmp_path / "out.gpkg", "elements")
@@ -248,9 +254,22 @@ def test_layers_in_different_crs_meet_in_the_first_one(run, tmp_path):
     looks = gpd.GeoSeries([line((0, 0), (30, 0)), line((1, 0.5), (29, 0.5))], crs=UTM)
     one = draw(tmp_path / "one.gpkg", looks[:1])
     other = draw(tmp_path / "other.gpkg", looks[1:].to_crs(4326), crs=4326)
+    alike = draw(tmp_path / "other.shp", looks[1:])
     assert run("merge", one, other, "-o", tmp_path / "out.gpkg").code == 0
+    assert run("merge", one, alike, "-o", tmp_path / "expected.gpkg").code == 0
+    (merged,), (expected,) = (look(tmp_path / name, "elements").geometry for name in ("out.gpkg", "expected.gpkg"))
+    assert look(tmp_path / "out.gpkg", "elements").crs == UTM
+    assert merged.hausdorff_distance(expected) < 1e-5
+    # Halfway between the two.
+    assert np.abs(np.subtract(merged.coords, (EAST, NORTH + 0.25))[:, 1]).max() < 0.1
+
+
+def test_layers_in_different_crs_meet_in_the_first_one_by_the_published_method(run, tmp_path):
+    looks = gpd.GeoSeries([line((0, 0), (30, 0)), line((1, 0.5), (29, 0.5))], crs=UTM)
+    one = draw(tmp_path / "one.gpkg", looks[:1])
+    other = draw(tmp_path / "other.gpkg", looks[1:].to_crs(4326), crs=4326)
+    assert run("merge", one, other, "--method", "polymerge", "-o", tmp_path / "out.gpkg").code == 0
     merged = look(tmp_path / "out.gpkg", "elements")
-    assert merged.crs == UTM
     assert np.allclose(
         coordinates(merged)[0], np.add([[0, 0], [1, 0.25], [29, 0.25], [30, 0]], (EAST, NORTH)), atol=1e-6
     )
@@ -493,15 +512,41 @@ def test_a_companion_that_exists_is_told_before_the_work(run, tmp_path, monkeypa
     assert (tmp_path / "m_tables.gpkg").read_bytes() == b"kept"
 
 
-def test_the_consensus_of_the_sample(run, tmp_path, sample_folder):
-    local, merged, report = (tmp_path / name for name in ("local.gpkg", "merged.gpkg", "report.json"))
+@pytest.fixture
+def sample_local(run, tmp_path, sample_folder):
+    """The local maps of the sample."""
+    local = tmp_path / "local.gpkg"
     predictions, poses = sample_folder / "predictions.json", sample_folder / "poses.csv"
     assert run("project", predictions, "--poses", poses, "--crs", UTM, "-o", local).code == 0
-    done = run("merge", local, "--method", "consensus", "-o", merged, "--json", report)
-    assert done.code == 0
+    return local
+
+
+@pytest.mark.parametrize("chosen", [[], ["--method", "consensus"]], ids=["by default", "by its name"])
+def test_the_consensus_of_the_sample(run, tmp_path, sample_local, chosen):
+    merged, report = tmp_path / "merged.gpkg", tmp_path / "report.json"
+    assert run("merge", sample_local, *chosen, "-o", merged, "--json", report).code == 0
     elements = look(merged, "elements")
     assert elements["sigma_m"].notna().any()
     assert elements["score"].between(0, 1).all()
     assert set(look(merged, "lineage")["element_id"]) == set(elements["element_id"])
     assert "seen by too few" in " ".join(look(merged, "left_out")["reason"])
-    assert json.loads(report.read_text())["corrections"]["shift_m_median"] > 0
+    told = json.loads(report.read_text())
+    assert told["method"] == "consensus"
+    assert told["corrections"]["shift_m_median"] > 0
+
+
+def test_the_published_method_of_the_sample(run, tmp_path, sample_local):
+    merged, report = tmp_path / "merged.gpkg", tmp_path / "report.json"
+    assert run("merge", sample_local, "--method", "polymerge", "-o", merged, "--json", report).code == 0
+    assert "sigma_m" not in look(merged, "elements")
+    assert len(look(merged, "left_out")) == 0
+    told = json.loads(report.read_text())
+    assert told["method"] == "polymerge"
+    assert "corrections" not in told
+
+
+def test_help_names_the_default_method_first_and_what_belongs_to_one_method(run):
+    text = " ".join(run("merge", "--help").out.split())
+    assert "--method [consensus|polymerge]" in text
+    assert "[default: consensus]" in text
+    assert "Of polymerge, for area classes" in text

@@ -89,7 +89,7 @@ def seconds_of(child: subprocess.Popen[str]) -> float:
 
 
 def in_the_middle(progress: dict[str, object]) -> bool:
-    return progress["message"] == "merging" and float(str(progress["fraction"])) > 0.4
+    return progress["message"] == "finding the consensus"
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
@@ -151,7 +151,7 @@ def test_a_standard_input_that_was_never_open_ends_it_at_once(outputs, tmp_path)
     assert contents(outputs) == {"map.gpkg": OLD}
 
 
-@pytest.mark.parametrize("message", ["reading the layers", "looking for neighbours", "merging", "writing"])
+@pytest.mark.parametrize("message", ["reading the layers", "finding the consensus", "writing"])
 def test_a_kill_leaves_the_old_output_whole(outputs, roads_to_kill, message):
     delay = np.random.default_rng(len(message)).uniform(0.0, 0.02)
     with started(roads_to_kill, outputs) as child:
