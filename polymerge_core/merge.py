@@ -180,8 +180,8 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
     >>> merge(looks, crs="local").elements.geometry.to_wkt(rounding_precision=1).tolist()
     ['LINESTRING (5 0.1, 14 0.1)']
     >>> looks = gpd.GeoSeries([LineString([(0, 0), (9, 0)]), LineString([(1, 0.5), (8, -0.5)])])
-    >>> merge(looks, crs="local", method="polymerge").elements.geometry.to_wkt().tolist()
-    ['LINESTRING (0 0, 1 0.25, 8 -0.25, 9 0)']
+    >>> merge(looks, crs="local", method="polymerge").elements.geometry.to_wkt(rounding_precision=2).tolist()
+    ['LINESTRING (0 0, 1 0.25, 8.01 -0.23, 9 0)']
     """
     options = Options.of(
         class_field=class_field,

@@ -81,8 +81,9 @@ def layer_parameters() -> list[QgsProcessingParameterDefinition]:
         explained(
             with_decimals(proximity),
             tr(
-                "Lines that come nearer to each other than this are taken for the same element. In metres on the "
-                "ground, whatever the CRS of the layers; at most 1000 m."
+                "Lines that run nearer to each other than this are taken for the same element; by the method "
+                "polymerge, lines that come so near anywhere. In metres on the ground, whatever the CRS of the layers; "
+                "at most 1000 m."
             ),
         ),
         explained(
@@ -90,6 +91,18 @@ def layer_parameters() -> list[QgsProcessingParameterDefinition]:
             tr("An earlier result to merge into; its elements keep their ids."),
         ),
     ]
+
+
+def footprint_parameter() -> QgsProcessingParameterDefinition:
+    """Return what the local maps looked at."""
+    return explained(
+        QgsProcessingParameterVectorLayer("INSTANCES", tr("Footprints"), types=[_AREAS], optional=True),
+        tr(
+            "What the local maps looked at, as Project local maps gives it: polygons with the columns drive and "
+            "instance. The method consensus leaves out what far fewer local maps saw than looked there; without "
+            "footprints it leaves out nothing."
+        ),
+    )
 
 
 def column_parameters() -> list[QgsProcessingParameterDefinition]:

@@ -43,6 +43,9 @@ _ALIASES = "id_aliases"
 _CONTRACT = frozenset({"local_maps", "elements"})
 _MAIN_MAP = {"MAIN_MAP": "elements", "MAIN_MAP_AREAS": "elements_areas", "MAIN_MAP_ALIASES": _ALIASES}
 
+#: What the local maps looked at; only a merge asks for it.
+_INSTANCES = "INSTANCES"
+
 
 class LayerAlgorithm(WorkerAlgorithm):
     """An algorithm whose inputs are the layers to merge, and perhaps a main map."""
@@ -51,6 +54,7 @@ class LayerAlgorithm(WorkerAlgorithm):
         super().__init__()
         self._layers: list[Input] = []
         self._main_map: dict[str, Input] = {}
+        self._instances: Input | None = None
 
     def prepareAlgorithm(
         self, parameters: Parameters, context: QgsProcessingContext, feedback: QgsProcessingFeedback
@@ -62,6 +66,8 @@ class LayerAlgorithm(WorkerAlgorithm):
         for warning in filter(None, map(passed_over, layers)):
             feedback.pushWarning(warning)
         self._layers = layer_inputs(layers, selected_only=selected)
+        instances = self.parameterAsVectorLayer(parameters, _INSTANCES, context)
+        self._instances = None if instances is None else layer_input(instances)
         for name, part in _MAIN_MAP.items():
             layer = self.parameterAsVectorLayer(parameters, name, context)
             if layer is not None:
@@ -71,11 +77,16 @@ class LayerAlgorithm(WorkerAlgorithm):
     def stage(self, parameters: Parameters, context: QgsProcessingContext, folder: Path, part: Part) -> Staged:
         """Write the layers into GeoPackages that bear their names."""
         del parameters, context
-        pieces = iter(part.pieces(len(self._layers) + len(self._main_map)))
+        # The worker reads the footprints that it finds beside a layer of this name.
+        known = [] if self._instances is None else [self._instances]
+        table = "local_maps" if known else "features"
+        pieces = iter(part.pieces(len(self._layers) * (1 + len(known)) + len(self._main_map)))
         titles = {}
         for name, given in zip(file_names([each.title for each in self._layers]), self._layers):
             file = folder / "layers" / f"{name}.gpkg"
-            stage_layer(given, file, "features", next(pieces))
+            stage_layer(given, file, table, next(pieces))
+            for instances in known:
+                stage_layer(instances, file, "instances", next(pieces))
             titles[str(file)] = f"“{given.title}”"
         inputs = list(titles)
         if not self._main_map:
@@ -89,7 +100,7 @@ class LayerAlgorithm(WorkerAlgorithm):
     def places_read(self, parameters: Parameters, context: QgsProcessingContext) -> list[Place]:
         """Return the files of the layers that lie in files."""
         layers = self.parameterAsLayerList(parameters, "LOCAL_MAPS", context)
-        layers += [self.parameterAsVectorLayer(parameters, name, context) for name in _MAIN_MAP]
+        layers += [self.parameterAsVectorLayer(parameters, name, context) for name in (_INSTANCES, *_MAIN_MAP)]
         return [place_of_layer(layer) for layer in layers if isinstance(layer, QgsVectorLayer) and file_of(layer)]
 
     def fault(self, parameters: Parameters, context: QgsProcessingContext) -> str:
@@ -109,14 +120,19 @@ class LayerAlgorithm(WorkerAlgorithm):
             len(opened) < len(given) or not all(isinstance(layer, QgsVectorLayer) for layer in opened)
         ):
             return tr("One of the layers to merge cannot be opened as a vector layer: choose the layers again.")
-        for name in _MAIN_MAP:
+        for name in (_INSTANCES, *_MAIN_MAP):
             if parameters.get(name) and self.parameterAsVectorLayer(parameters, name, context) is None:
                 title = self.parameterDefinition(name).description()
                 return tr("The layer that is given as {} ({}) cannot be opened: choose it again.").format(title, name)
         aliases = self.parameterAsVectorLayer(parameters, "MAIN_MAP_ALIASES", context)
-        if aliases is not None and any(aliases.fields().lookupField(name) < 0 for name in ("old_id", "element_id")):
+        if aliases is not None and _lacks(aliases, "old_id", "element_id"):
             return tr("Layer “{}” is no table of retired ids, which has the columns old_id and element_id.").format(
                 aliases.name()
+            )
+        instances = self.parameterAsVectorLayer(parameters, _INSTANCES, context)
+        if instances is not None and _lacks(instances, "drive", "instance"):
+            return tr("Layer “{}” is none of footprints, which has the columns drive and instance.").format(
+                instances.name()
             )
         return ""
 
@@ -137,6 +153,10 @@ class LayerAlgorithm(WorkerAlgorithm):
             for layer in [*layers, *([] if main_map is None else [main_map])]
         )
         return next(filter(None, faults), "")
+
+
+def _lacks(layer: QgsVectorLayer, *names: str) -> bool:
+    return any(layer.fields().lookupField(name) < 0 for name in names)
 
 
 def crs_contradiction(*, declared: bool, plain: bool) -> str:

@@ -9,6 +9,7 @@ from qgis.core import QgsProcessingParameterDefinition
 from ..parameters import (
     choice_parameter,
     column_parameters,
+    footprint_parameter,
     layer_parameters,
     map_parameters,
     share_parameter,
@@ -43,20 +44,24 @@ class MergeLocalMaps(LayerAlgorithm):
         """Return the layers, their columns, and how to merge."""
         return [
             *layer_parameters(),
+            footprint_parameter(),
             *column_parameters(),
             choice_parameter(
                 "METHOD",
                 tr("Method"),
                 tr(
-                    "polymerge: the method as it was published. consensus: one smooth line from all looks at it, more "
-                    "exact than each; what too few local maps saw is left out where footprints are known."
+                    "consensus: one smooth line from all looks at it, more exact than each; what too few local maps "
+                    "saw is left out where footprints are known. polymerge: the method as it was published."
                 ),
-                ("polymerge", "consensus"),
+                ("consensus", "polymerge"),
             ),
             share_parameter(
                 "COVERAGE",
                 tr("Coverage of areas"),
-                tr("The share of the observations of an area that must cover a place for it to belong to the area."),
+                tr(
+                    "Of the method polymerge: the share of the observations of an area that must cover a place for it "
+                    "to belong to the area. consensus does not use it."
+                ),
                 default=0.5,
             ),
             text_parameter(
@@ -64,7 +69,8 @@ class MergeLocalMaps(LayerAlgorithm):
                 tr("How columns are carried"),
                 tr(
                     "first, mode, mean, min, max or sum for all columns, or COLUMN=FUNCTION for single ones, with "
-                    "commas between. first: from the observation that the others were merged into."
+                    "commas between. first: from the element of the main map, else from the longest observation "
+                    "(polymerge: the longest of the earliest local map)."
                 ),
                 default="first",
             ),
@@ -79,7 +85,7 @@ class MergeLocalMaps(LayerAlgorithm):
                 tr("Merged map"),
                 ("elements",),
                 "line",
-                tr("One line for each element, with its id, class, mean score and number of observations."),
+                tr("One line for each element, with its id, class, score and number of observations."),
                 style="merged_map",
                 optional=False,
                 shown_empty=True,
@@ -115,7 +121,7 @@ class MergeLocalMaps(LayerAlgorithm):
                 tr("Retired ids"),
                 ("id_aliases",),
                 "table",
-                tr("The ids of elements of a main map that became part of another one."),
+                tr("The ids of elements of a main map that became part of another one, or were left out (-1)."),
                 style="id_aliases",
                 precious=True,
             ),

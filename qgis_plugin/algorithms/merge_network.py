@@ -19,10 +19,11 @@ class MergeNetwork(LayerAlgorithm):
     TITLE = mark("Merge network")
     ICON = "network"
     TAGS = mark("network,graph,component,cluster,group,merge,line,polyline,GPS,track,HD map")
-    SUMMARY = mark("Shows which lines would be merged with each other: the network behind a merge.")
+    SUMMARY = mark("Shows which lines the method polymerge would merge with each other: the network behind it.")
     HELP = mark(
-        "Lines that are coloured alike become one element. Look here when a merge joins what does not belong together, "
-        "and choose a smaller proximity or a higher lowest score."
+        "Lines that are coloured alike become one element by the method polymerge. Look here when it joins what does "
+        "not belong together, and choose a smaller proximity, a higher lowest score, or the method consensus, which "
+        "has no such network."
     )
     COMMAND = "network"
     OPTIONS = READING_OPTIONS

@@ -137,7 +137,7 @@ class TestEvery:
         wanted = {
             "setup": {"PYTHON", "USE_AS_IS", "WHEELS", "CHECK_ONLY"},
             "projectlocalmaps": files | {"CRS", "POSE_KIND", "OUTPUT", "INSTANCES", "LEFT_OUT"},
-            "mergelocalmaps": layers | {"AREAS", "LINEAGE", "LEFT_OUT", "ID_ALIASES"},
+            "mergelocalmaps": layers | {"INSTANCES", "AREAS", "LINEAGE", "LEFT_OUT", "ID_ALIASES"},
             "mergenetwork": layers | {"EDGES"},
             "evaluatemap": compared | {"OUTPUT", "EVALUATED", "EVALUATED_AREAS", "MEASURES", "PAGE"},
         }
@@ -281,6 +281,20 @@ class TestFaultsOfLayers:
         given = {"MAIN_MAP": memory_layer([track()]), part: "/nowhere/at/all.gpkg"}
         with pytest.raises(QgsProcessingException, match=r"cannot be opened|Could not load"):
             run("mergelocalmaps", LOCAL_MAPS=[memory_layer([track()])], OUTPUT="memory:", **given)
+
+    def test_footprints_that_name_no_local_maps_are_refused(self, context):
+        given = memory_layer([], kind="Polygon", name="boxes")
+        message = check("mergelocalmaps", context, LOCAL_MAPS=[memory_layer([track()])], INSTANCES=given)
+        assert message == "Layer “boxes” is none of footprints, which has the columns drive and instance."
+
+    def test_footprints_that_cannot_be_opened_are_not_merged_without(self, run, ready):
+        with pytest.raises(QgsProcessingException, match=r"cannot be opened|Could not load"):
+            run(
+                "mergelocalmaps",
+                LOCAL_MAPS=[memory_layer([track()])],
+                INSTANCES="/nowhere/at/all.gpkg",
+                OUTPUT="memory:",
+            )
 
     @merging
     def test_no_layer_is_refused(self, name, context):

@@ -35,6 +35,7 @@ ONLY_IN_QGIS = {
     "PAGE": "--output",
     "PREDICTIONS": "the input",
     "SELECTED_ONLY": "files have no selection",
+    "INSTANCES": "a layer beside the local maps, in their file",
     "MAIN_MAP_AREAS": "a part of --main-map",
     "MAIN_MAP_ALIASES": "a part of --main-map",
     "LOCAL_CRS": "--crs=local",

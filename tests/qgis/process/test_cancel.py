@@ -98,7 +98,7 @@ def test_a_worker_ends_by_itself_when_qgis_is_killed(qgis: Qgis, city: Path, old
 
 def started(qgis: Qgis, layer: Path, output: Path, temporary: Path) -> Started:
     """Start a merge that takes far longer than the test waits for it."""
-    parameters = {"LOCAL_MAPS": layer, "METHOD": "consensus", "OUTPUT": output}
+    parameters = {"LOCAL_MAPS": layer, "OUTPUT": output}
     return qgis.start("polymerge:mergelocalmaps", parameters, TMPDIR=str(temporary))
 
 

@@ -30,7 +30,8 @@ def shapefiles(qgis: Qgis, roads: Path, tmp_path_factory: pytest.TempPathFactory
 def test_a_shapefile_has_the_names_and_values_of_the_command_line(shapefiles: tuple[str, Path]) -> None:
     found, wanted = map(table, shapefiles)
 
-    assert list(found.columns) == ["elem_id", "class", "score", "n_obs", "n_inst", "length_m", "name", "geometry"]
+    numbers = ["score", "n_obs", "n_inst", "length_m", "sigma_m"]
+    assert list(found.columns) == ["elem_id", "class", *numbers, "name", "geometry"]
     assert found.drop(columns="geometry").to_dict("list") == wanted.drop(columns="geometry").to_dict("list")
     assert list(shapely.to_wkb(found.geometry)) == list(shapely.to_wkb(wanted.geometry))
     assert found.crs == wanted.crs

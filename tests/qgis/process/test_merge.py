@@ -130,13 +130,33 @@ def test_the_sample_is_projected_and_merged_as_on_the_command_line(
     projected = qgis.run(
         "polymerge:projectlocalmaps", {"PREDICTIONS": predictions, "POSES": poses, "CRS": UTM, **ours}
     ).results
-    done = qgis.merge(projected["OUTPUT"], MIN_SCORE=0.3, **destinations(tmp_path / "out"))
+    known = {"INSTANCES": projected["INSTANCES"], "MIN_SCORE": 0.3}
+    done = qgis.merge(projected["OUTPUT"], **known, **destinations(tmp_path / "out"))
 
     assert_same(projected["OUTPUT"], local, "local_maps")
     assert_same(projected["INSTANCES"], local, "instances")
     assert (projected["N_OBSERVATIONS"], projected["N_INSTANCES"], projected["N_LEFT_OUT"]) == (197, 20, 0)
     assert_same_merge(done.results, merged)
-    assert [done.results[name] for name in COUNTS] == [16, 196, 1]
+    assert [done.results[name] for name in COUNTS] == [21, 196, len(table(merged, "left_out"))]
+    assert set(table(done.results["LEFT_OUT"])["reason"]) == {
+        "seen by too few of the local maps that looked there",
+        "the score is under min_score (0.3)",
+    }
+
+
+def test_without_footprints_nothing_is_left_out_for_want_of_sightings(
+    qgis: Qgis, sample_folder: Path, tmp_path: Path
+) -> None:
+    local, alone, merged = (tmp_path / f"{name}.gpkg" for name in ("local", "alone", "merged"))
+    predictions, poses = sample_folder / "predictions.json", sample_folder / "poses.csv"
+    command_line("project", predictions, "--poses", poses, "--crs", UTM, "-o", local)
+    table(local, "local_maps").to_file(alone, layer="local_maps")
+    command_line("merge", alone, "-o", merged)
+
+    done = qgis.merge(f"{local}|layername=local_maps", **destinations(tmp_path / "out"))
+
+    assert_same_merge(done.results, merged, but_for=("source",))
+    assert done.results["N_LEFT_OUT"] == 0
 
 
 def test_the_network_of_the_sample_is_that_of_the_command_line(qgis: Qgis, sample_folder: Path, tmp_path: Path) -> None:
@@ -174,7 +194,8 @@ def test_an_evaluation_of_the_sample_is_that_of_the_command_line(
     assert_same(done["OUTPUT"], expected, "errors")
     assert_same(done["EVALUATED"], expected, "evaluated")
     assert_same(done["MEASURES"], expected, "measures")
-    assert (done["N_ELEMENTS"], done["N_REFERENCE"]) == (16, len(table(sample_folder / "reference.gpkg")))
+    elements = len(table(merged, "elements"))
+    assert (done["N_ELEMENTS"], done["N_REFERENCE"]) == (elements, len(table(sample_folder / "reference.gpkg")))
     assert "<h2>divider</h2>" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
@@ -222,11 +243,11 @@ def test_only_what_a_filter_lets_through_is_merged(qgis: Qgis, tmp_path: Path) -
 
 def test_merges_into_a_main_map_keep_its_ids_and_never_give_one_twice(qgis: Qgis, tmp_path: Path) -> None:
     first, second, third = (tmp_path / f"{name}.gpkg" for name in ("first", "second", "third"))
-    parallels = [line((0, 0), (40, 0)), line((0, 6), (40, 6)), area((50, 0), (54, 0), (54, 8), (50, 8))]
-    old = draw(tmp_path / "old.gpkg", parallels, **{"class": ["divider", "divider", "ped_crossing"]})
+    pieces = [line((0, 0), (40, 0)), line((46, 0), (90, 0)), area((50, 20), (54, 20), (54, 28), (50, 28))]
+    old = draw(tmp_path / "old.gpkg", pieces, **{"class": ["divider", "divider", "ped_crossing"]})
     command_line("merge", old, "-o", first)
-    bridge = draw(tmp_path / "bridge.gpkg", [line((10, 0), (10, 6)), line((70, 0), (90, 0))])
-    more = draw(tmp_path / "more.gpkg", [line((70, 1), (90, 1)), line((0, 90), (40, 90))])
+    bridge = draw(tmp_path / "bridge.gpkg", [line((10, 0.5), (80, 0.5)), line((70, 50), (90, 50))])
+    more = draw(tmp_path / "more.gpkg", [line((70, 51), (90, 51)), line((0, 90), (40, 90))])
     options = ["--class-name", "divider", "--proximity", 2]
     command_line("merge", bridge, "--main-map", first, *options, "-o", second)
     command_line("merge", more, "--main-map", second, *options, "-o", third)

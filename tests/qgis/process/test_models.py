@@ -67,6 +67,7 @@ def sample_model(qgis: Qgis, tmp_path_factory: pytest.TempPathFactory) -> Path:
         step(
             model, "merge", "polymerge:mergelocalmaps",
             LOCAL_MAPS=Source.fromChildOutput("project", "OUTPUT"),
+            INSTANCES=Source.fromChildOutput("project", "INSTANCES"),
             MIN_SCORE=Source.fromStaticValue(0.3),
         )
         output(model, "merge", "OUTPUT", "merged")
