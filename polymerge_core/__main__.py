@@ -266,12 +266,13 @@ def evaluate(
 
 @cli.command("demo")
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default="polymerge_demo")
+@click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True)
 @click.option("--overwrite", is_flag=True, help="Replace the outputs of an earlier run.")
-def run_demo(folder: Path, *, overwrite: bool) -> None:
+def run_demo(folder: Path, *, method: str, overwrite: bool) -> None:
     """Merge the sample, a simulated drive through a town junction, into FOLDER and draw it."""
     from polymerge_core import demo  # noqa: PLC0415 - matplotlib is slow to load, and only this command draws
 
-    click.echo(demo.run_demo(folder, overwrite=overwrite))
+    click.echo(demo.run_demo(folder, method=method, overwrite=overwrite))
 
 
 @cli.command()

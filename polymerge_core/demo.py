@@ -13,13 +13,17 @@ from polymerge_core.formats import read_poses, read_predictions
 from polymerge_core.frames import project
 from polymerge_core.io import read_layers, stage_layers
 from polymerge_core.merge import merge
+from polymerge_core.options import METHODS
 from polymerge_core.outputs import StagedOutputs
 
 #: The sample lies in the open North Sea, in this CRS.
 CRS = "EPSG:32632"
 
-#: A spot of the sample where the faults of the published method are plain to see, metres in `CRS`.
+#: A spot of the sample where the methods differ, metres in `CRS`.
 ZOOM = (399975.0, 6039990.0, 400000.0, 6040005.0)
+
+
+_TITLES = {"consensus": "consensus", "polymerge": "the published method"}
 
 
 def sample_folder() -> Path:
@@ -29,13 +33,15 @@ def sample_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "resources" / "sample"
 
 
-def run_demo(folder: Path, *, overwrite: bool = False) -> str:
+def run_demo(folder: Path, *, method: str = METHODS[0], overwrite: bool = False) -> str:
     """Project and merge the sample, draw before and after.
 
     Parameters
     ----------
     folder : Path
         Where `local_maps.gpkg`, `merged.gpkg` and `before_after.png` go; made if it is not there.
+    method : {"consensus", "polymerge"}, default "consensus"
+        As in `polymerge_core.merge`.
     overwrite : bool, default False
         Whether outputs of an earlier run are replaced.
 
@@ -58,12 +64,12 @@ def run_demo(folder: Path, *, overwrite: bool = False) -> str:
     with StagedOutputs(overwrite=overwrite) as outputs:
         outputs.check(targets)
         local = project(read_predictions(sample / "predictions.json"), read_poses(sample / "poses.csv"), crs=CRS)
-        result = merge(local)
+        result = merge(local, method=method)
         reference = read_layers(sample / "reference.gpkg")["ground_truth"]
         stage_layers(outputs, targets[0], local.layers())
         stage_layers(outputs, targets[1], result.layers())
         picture = outputs.stage(targets[2])
-        title = f"A town junction seen {result.report['instances']} times, merged by the published method"
+        title = f"A town junction seen {result.report['instances']} times, merged by {_TITLES[method]}"
         before_after(local.observations, result.elements, picture, reference=reference, title=title, zoom=ZOOM)
     summary = pd.DataFrame(result.report["classes"]).T.rename_axis("class")
     summary = summary.astype({"observations": int, "elements": int}).round(1)

@@ -374,6 +374,12 @@ def test_demo_writes_maps_and_a_picture_once(run, tmp_path):
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_demo_merges_by_the_method_that_is_asked_for(run, tmp_path, method):
+    assert run("demo", tmp_path, "--method", method).code == 0
+    assert ("sigma_m" in look(tmp_path / "merged.gpkg", "elements")) == (method == "consensus")
+
+
 # -- formats ---------------------------------------------------------------------------------------
 
 

@@ -49,6 +49,7 @@ ALGORITHMS = {
     "polymerge:setup": "Set up PolyMerge",
 }
 MERGE, NETWORK, PROJECT = "polymerge:mergelocalmaps", "polymerge:mergenetwork", "polymerge:projectlocalmaps"
+EVALUATE = "polymerge:evaluatemap"
 
 PYTHON_SETTING = "POLYMERGE_PYTHON"
 
@@ -138,12 +139,16 @@ def say_without_environment() -> None:
     ProcessingConfig.setSettingValue(PYTHON_SETTING, python)
 
 
+def sample(file: str) -> Path:
+    """Return a file of the sample that the plugin brings."""
+    return Path(sys.modules["polymerge"].__file__).parent / "resources" / "sample" / file
+
+
 def project_sample() -> None:
     """Predictions and poses become a styled layer."""
-    sample = Path(sys.modules["polymerge"].__file__).parent / "resources" / "sample"
     values = {
-        "PREDICTIONS": str(sample / "predictions.json"),
-        "POSES": str(sample / "poses.csv"),
+        "PREDICTIONS": str(sample("predictions.json")),
+        "POSES": str(sample("poses.csv")),
         "CRS": "EPSG:32632",
     }
     in_dialog(lambda: open_algorithm(PROJECT), lambda dialog: run(dialog, values))
@@ -156,7 +161,7 @@ def project_sample() -> None:
 
 def merge_sample() -> None:
     """The local maps become one map, from the dialog."""
-    values = {"LOCAL_MAPS": [layer("Local maps").id()]}
+    values = {"LOCAL_MAPS": [layer("Local maps").id()], "INSTANCES": layer("Footprints").id()}
 
     def use(dialog: QDialog) -> None:
         dialog.resize(*DIALOG)
@@ -171,7 +176,7 @@ def merge_sample() -> None:
     names = sorted(each.name() for each in QgsProject.instance().mapLayers().values())
     RECORD.check(
         "results bear their names, and empty ones are not loaded",
-        names == ["Footprints", "Lineage", "Local maps", "Merged map"],
+        names == ["Footprints", "Left out", "Lineage", "Local maps", "Merged map"],
         names,
     )
     merged = layer("Merged map")
@@ -194,6 +199,26 @@ def look_at_table() -> None:
     RECORD.check("the attribute table begins with the element", shown[0] == "Element", shown)
     picture("qgis_attribute_table", window)
     window.close()
+
+
+def evaluate_map() -> None:
+    """The error along the merged map, in colour."""
+    reference = iface.addVectorLayer(f"{sample('reference.gpkg')}|layername=ground_truth", "Reference", "ogr")
+    reference.renderer().symbol().setColor(QColor("#8a8a8a"))
+    values = {
+        "MERGED": [layer("Merged map").id()],
+        "REFERENCE": [reference.id()],
+        "LOCAL_MAPS": [layer("Local maps").id()],
+    }
+    in_dialog(lambda: open_algorithm(EVALUATE), lambda dialog: run(dialog, values))
+    errors = layer("Errors along the map")
+    check_columns("Errors along the map", errors)
+    show_only("Errors along the map", "Reference")
+    zoom(errors)
+    picture("qgis_errors", iface.mainWindow())
+    known = {"Footprints", "Left out", "Lineage", "Local maps", "Merged map"}
+    project = QgsProject.instance()
+    project.removeMapLayers([each.id() for each in project.mapLayers().values() if each.name() not in known])
 
 
 def merge_network() -> None:
@@ -410,6 +435,7 @@ STEPS: tuple[Callable[[], None], ...] = (
     project_sample,
     merge_sample,
     look_at_table,
+    evaluate_map,
     merge_network,
     merge_in_batch,
     cancel,
