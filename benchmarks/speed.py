@@ -70,7 +70,7 @@ def measure(count: int, *, lines: int) -> dict[str, float]:
         # The yardstick: the same layer, read and written by geopandas alone. The first write loads the libraries.
         layer.head(1).to_file(folder / "warm.gpkg", layer="local_maps")
         gpd.read_file(folder / "warm.gpkg", use_arrow=True)
-        pm.merge(layer.head(30))
+        pm.merge(layer.head(30), method="polymerge")
         start = time.perf_counter()
         layer.to_file(folder / "local.gpkg", layer="local_maps", VERSION="1.3")
         gpd.read_file(folder / "local.gpkg", use_arrow=True)
@@ -82,7 +82,7 @@ def measure(count: int, *, lines: int) -> dict[str, float]:
         clock.append(time.perf_counter())
         order_sets(find_network(local, None, Options(), lambda *_: None, distances=False))
         clock.append(time.perf_counter())
-        result = pm.merge(local)
+        result = pm.merge(local, method="polymerge")
         clock.append(time.perf_counter())
         pm.write_layers(folder / "merged.gpkg", result.layers())
         clock.append(time.perf_counter())
