@@ -94,7 +94,8 @@ def test_fourteen_drives_together(real_data, tmp_path, capsys):
     assert len(files) == 14
     capsys.readouterr()
     merged = tmp_path / "merged.gpkg"
-    run("merge", *files, "-o", merged, "--json", tmp_path / "report.json", "--progress", "json")
+    told = ("--json", tmp_path / "report.json", "--progress", "json")
+    run("merge", *files, "--method", "polymerge", "-o", merged, *told)
     fractions = [json.loads(line)["fraction"] for line in capsys.readouterr().err.splitlines() if line[0] == "{"]
     assert fractions == sorted(fractions)
     assert len(fractions) > 50
