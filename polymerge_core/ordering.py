@@ -97,10 +97,10 @@ def _instance_rank(parts: pd.DataFrame) -> NDArray[np.intp]:
         keyed = parts[["timestamp_ns", "key", "content"]].assign(local=~parts["is_main"], start=drive_start)
         return keyed.groupby(["local", "start", "timestamp_ns", "key", "content"]).ngroup().to_numpy()
     if (instances["kind"] == "column").all():
-        ranked = instances.assign(is_main=~instances["is_main"].astype(bool))
+        ranked = instances.assign(local=~instances["is_main"].astype(bool))
         for name in ("drive", "instance"):
             ranked[name] = natural_rank(instances[name])
-        keyed = ranked.groupby(["is_main", "drive_start", "drive", "time", "instance"], dropna=False)
+        keyed = ranked.groupby(["local", "drive_start", "drive", "time", "instance"])
         return keyed.ngroup().to_numpy()[group]
     # The normalised WKB of all observations first; where it is the same, class, direction and columns.
     content = zip(_sorted_by(group, parts["key"]), _sorted_by(group, parts["content"]), strict=True)

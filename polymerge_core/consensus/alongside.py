@@ -24,7 +24,7 @@ ANGLE_DEG = 35.0
 #: A pair is looked at every two proximities along the shorter one, at most so often.
 _STATIONS = 12
 
-#: Where a pair first comes close is looked for at every so manieth point of the longer look.
+#: Where a pair first comes close is looked for at the first of every so many points of the longer look.
 _COARSE = 8
 
 #: Pairs that are measured at a time, so that what is worked out on the way stays small.
@@ -90,12 +90,8 @@ def pairs_alongside(looks: Looks, kind: Index) -> Pairs:
 def _near(looks: Looks, kind: Index) -> tuple[Index, Index]:
     """Return the pairs of looks of one kind that come near each other, each once; the first comes before the second."""
     lines, distance = looks.curves.lines, 2 * REACH * looks.unit
-    west, south, east, north = shapely.bounds(lines).T
-    # Boxes of two kinds are told apart by where they are.
-    beyond = kind * (np.ptp([west, east]) + 2 * distance) if len(lines) else west
-    boxes = shapely.box(west + beyond, south, east + beyond, north)
-    around = shapely.box(west + beyond - distance, south - distance, east + beyond + distance, north + distance)
-    tree, blocks = shapely.STRtree(boxes), np.array_split(np.arange(len(lines)), 1 + len(lines) // _LOOKS)
+    tree, around = boxes_of_kinds(lines, kind, lines, kind, distance)
+    blocks = np.array_split(np.arange(len(lines)), 1 + len(lines) // _LOOKS)
     some = [_some(looks, rows, tree.query(around[rows])) for rows in blocks]
     pairs = distinct(np.concatenate(some))
     first, second = pairs // max(len(lines), 1), pairs % max(len(lines), 1)
@@ -103,6 +99,21 @@ def _near(looks: Looks, kind: Index) -> tuple[Index, Index]:
     parts = np.array_split(np.arange(len(pairs)), 1 + len(pairs) // _BLOCK)
     near = np.concatenate([shapely.dwithin(lines[first[rows]], lines[second[rows]], distance) for rows in parts])
     return first[near], second[near]
+
+
+def boxes_of_kinds(
+    shapes: NDArray[np.object_], kind: Index, others: NDArray[np.object_], other_kind: Index, distance: float
+) -> tuple[shapely.STRtree, NDArray[np.object_]]:
+    """Return a tree of boxes, and the boxes to ask it with for what of the same kind is within a distance of others.
+
+    Boxes of two kinds are told apart by where they are: what is asked for is all that is found.
+    """
+    bounds, asked = shapely.bounds(shapes), shapely.bounds(others)
+    apart = (np.ptp(bounds[:, ::2]) if len(shapes) else 0.0) + 2 * distance
+    bounds[:, ::2] += (kind * apart)[:, None]
+    asked[:, ::2] += (other_kind * apart)[:, None]
+    asked += np.array([-distance, -distance, distance, distance])
+    return shapely.STRtree(shapely.box(*bounds.T)), np.asarray(shapely.box(*asked.T))
 
 
 def _some(looks: Looks, rows: Index, neighbours: Index) -> Index:
@@ -140,9 +151,8 @@ def _measured(looks: Looks, drawn: Axes, short: Index, long: Index) -> Pairs:
     feet = drawn.feet(place, theirs, unit, _beside(drawn, at, theirs, number))
     foot = looks.arc[feet.station] + feet.ahead
     cosine = dot(looks.tangent[at], feet.tangent)
-    last = drawn.first + drawn.counts - 1
     before = (feet.station == drawn.first[theirs]) & (feet.ahead < -0.3 * unit)
-    behind = (feet.station == last[theirs]) & (feet.ahead > 0.3 * unit)
+    behind = (feet.station == drawn.last[theirs]) & (feet.ahead > 0.3 * unit)
     beyond = ~curves.closed[theirs] & (before | behind)
     straight = np.abs(cosine) > np.cos(np.radians(ANGLE_DEG))
     beside = ~beyond & straight & (np.abs(feet.lateral) <= REACH * unit)
@@ -182,21 +192,22 @@ def _beside(drawn: Axes, at: Index, line: Index, number: Index) -> Index:
     number : ndarray of int, shape (k,)
         0 for the first of each look, then 1, 2, ...
     """
-    points, first, last = drawn.stations[at], drawn.first[line], (drawn.first + drawn.counts - 1)[line]
+    points, first, last = drawn.stations[at], drawn.first[line], drawn.last[line]
     found = np.empty(len(at), np.intp)
     rows = np.flatnonzero(number == 0)
     some, sample = count_up((last - first)[rows] // _COARSE + 1)
     tried = np.minimum(first[rows[some]] + sample * _COARSE, last[rows[some]])
+    away = ((drawn.stations[tried] - points[rows[some]]) ** 2).sum(axis=1)
+    near = tried[best_of_each(some, -away, tried)]
     while len(rows):
-        away = ((drawn.stations[tried] - points[rows[some]]) ** 2).sum(axis=1)
-        found[rows] = drawn.walked(points[rows], tried[best_of_each(some, -away, tried)])
+        found[rows] = drawn.walked(points[rows], near)
         rows = rows[rows + 1 < len(number)] + 1
         rows = rows[number[rows] > 0]
         # The next one is as far on, in either direction. From here one would not walk past a sharp corner.
-        step = at[rows] - at[rows - 1]
-        tried = np.concatenate([found[rows - 1] + way * step for way in (-1, 0, 1)])
-        some = np.tile(np.arange(len(rows)), 3)
-        tried = np.clip(tried, first[rows[some]], last[rows[some]])
+        step, here = at[rows] - at[rows - 1], found[rows - 1]
+        ways = np.clip(np.stack([here - step, here, here + step]), first[rows], last[rows])
+        nearest = ((drawn.stations[ways] - points[rows]) ** 2).sum(axis=2).argmin(axis=0)
+        near = ways[nearest, np.arange(len(rows))]
     return found
 
 

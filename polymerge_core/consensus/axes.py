@@ -81,6 +81,18 @@ class Axes:
         return np.bincount(self.line)
 
     @cached_property
+    def last(self) -> Index:
+        """The last station of each line."""
+        return self.first + self.counts - 1
+
+    @cached_property
+    def alone(self) -> Index:
+        """The stations, the last one of a ring called by its first, which is the same."""
+        station, ring = np.arange(len(self.line)), self.curves.closed
+        station[self.last[ring]] = self.first[ring]
+        return station
+
+    @cached_property
     def tangent(self) -> Array:
         """Direction of the line at each station, shape (s, 2)."""
         curves = self.curves
@@ -150,7 +162,7 @@ class Axes:
         share = np.clip(dot(chord, offset) / np.maximum(square, np.finfo(float).tiny), 0.0, 1.0)
         lateral = cross(tangent, offset) - share * cross(tangent, chord)
         beside = (square > 0) | (np.abs(ahead) <= 0.5 * unit)
-        return Feet(self._alone[station], lateral, tangent, ahead, beside)
+        return Feet(self.alone[station], lateral, tangent, ahead, beside)
 
     @cached_property
     def _columns(self) -> Array:
@@ -160,7 +172,7 @@ class Axes:
     @cached_property
     def _neighbours(self) -> tuple[Index, Index]:
         """The station after each and the one before it; a ring goes on past its end, and an open line does not."""
-        every, last = np.arange(len(self.line)), self.first + self.counts - 1
+        every, last = np.arange(len(self.line)), self.last
         after = np.minimum(every + 1, last[self.line])
         before = np.maximum(every - 1, self.first[self.line])
         ring = self.curves.closed
@@ -174,22 +186,11 @@ class Axes:
         chord = np.concatenate([self.stations[neighbour] - self.stations for neighbour in self._neighbours])
         return chord, dot(chord, chord)
 
-    @cached_property
-    def _alone(self) -> Index:
-        station = np.arange(len(self.line))
-        ring = self.curves.closed
-        station[(self.first + self.counts - 1)[ring]] = self.first[ring]
-        return station
-
-    def alone(self, station: Index) -> Index:
-        """Return stations with the last one of a ring called by its first, which is the same."""
-        return self._alone[station]
-
     def around(self, values: Any) -> Any:
         """Return values of stations with that of the first station of a ring given to its last, which is the same."""
         ring = np.flatnonzero(self.curves.closed)
         alike = values.copy()
-        alike[self.first[ring] + self.counts[ring] - 1] = values[self.first[ring]]
+        alike[self.last[ring]] = values[self.first[ring]]
         return alike
 
     def again(self, axes: Axes, station: Index) -> Index:
@@ -201,8 +202,7 @@ class Axes:
     def reaching(self, feet: Feet, line: Index) -> Axes:
         """Return the lines drawn out, or back, to where the first and the last of their points lie."""
         lengthened = self.stations.copy()
-        last = self.first + self.counts - 1
-        for ends, sign in ((self.first, -1.0), (last, 1.0)):
+        for ends, sign in ((self.first, -1.0), (self.last, 1.0)):
             here = np.flatnonzero(feet.station == ends[line])
             far = np.full(len(ends), -np.inf)
             np.maximum.at(far, line[here], sign * feet.ahead[here])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from polymerge_core.consensus.alongside import REACH
+from polymerge_core.consensus.alongside import REACH, boxes_of_kinds
 from polymerge_core.consensus.looks import Looks
 from polymerge_core.curves import Array, Curves, Index, best_of_each, distinct
 
@@ -38,7 +38,6 @@ class _Touches(NamedTuple):
     #: The merged line that it touches, and the end of that line that it touches, -1 where it is none.
     line: Index
     other: Index
-    instance: Index
 
 
 def met(
@@ -88,7 +87,8 @@ def met(
     onto = target[place[moving]]
     for _ in range(2):
         # A line that another one ends at may be drawn somewhere itself.
-        feet = _feet(shapes[onto], middle[place[moving]])
+        curves = Curves(shapes)
+        feet = curves.points_at(onto, curves.locate(onto, middle[place[moving]]))
         shapes = _drawn_to(shapes, moving, feet, unit)
     return _with_vertices(shapes, onto, feet)
 
@@ -111,8 +111,10 @@ def _touches(
     # Local maps touch as they were seen; where that is in the map, their points say, which were moved.
     there = shapely.points(np.concatenate([each.points for each in looks])[point])
     tips = shapely.get_point(lines[look], np.where(last, -1, 0))
-    tip, other = shapely.STRtree(lines).query(tips, predicate="dwithin", distance=_TOUCH * unit)
-    kept = (instance[look[tip]] == instance[other]) & (look[tip] != other) & (own[tip] >= 0)
+    # Local map by local map: where many looked, each end has thousands of others about it.
+    tree, around = boxes_of_kinds(lines, instance, tips, instance[look], _TOUCH * unit)
+    tip, other = tree.query(around)
+    kept = (look[tip] != other) & (own[tip] >= 0) & shapely.dwithin(tips[tip], lines[other], _TOUCH * unit)
     tip, other = tip[kept], other[kept]
     length = shapely.length(lines[other])
     along = shapely.line_locate_point(lines[other], tips[tip])
@@ -124,13 +126,13 @@ def _touches(
     kept &= ~(alone[np.maximum(own[tip], 0)] & alone[np.maximum(line, 0)])
     kept &= shapely.dwithin(there[tip], shapes[np.maximum(line, 0)], REACH * unit)
     tip, line, far = tip[kept], line[kept], far[kept]
-    touches = _Touches(seen_end[tip], line, far, instance[look[tip]])
+    touches = _Touches(seen_end[tip], line, far)
     # Local maps that saw the end, and those that saw it touch that line.
     width = int(instance.max(initial=0)) + 1
     some = seen_end >= 0
     seen = np.bincount(distinct(seen_end[some] * width + instance[look[some]]) // width, minlength=2 * len(shapes))
     pair = touches.end * len(shapes) + touches.line
-    said = distinct(pair * width + touches.instance) // width
+    said = distinct(pair * width + instance[look[tip]]) // width
     names, times = np.unique(said, return_counts=True)
     often = times[np.searchsorted(names, pair)] >= _MOST * seen[touches.end]
     return _Touches._make(column[often] for column in touches)
@@ -142,12 +144,6 @@ def _nearest_end(shapes: NDArray[np.object_], line: Index, points: NDArray[np.ob
     away = np.column_stack([shapely.distance(shapely.get_point(shapes[known], end), points) for end in (0, -1)])
     near = (line >= 0) & ~shapely.is_closed(shapes[known]) & (away.min(axis=1) <= REACH * unit)
     return np.where(near, 2 * known + away.argmin(axis=1), -1)
-
-
-def _feet(lines: NDArray[np.object_], points: Array) -> Array:
-    places = shapely.points(points)
-    feet = shapely.line_interpolate_point(lines, shapely.line_locate_point(lines, places))
-    return np.asarray(shapely.get_coordinates(feet), dtype=np.float64)
 
 
 def _drawn_to(shapes: NDArray[np.object_], ends: Index, points: Array, unit: float) -> NDArray[np.object_]:

@@ -77,7 +77,7 @@ def _beside(looks: Looks, axes: Axes, point: Index, station: Index) -> tuple[Bes
     lateral, ahead = cross(tangent, offset), np.abs(dot(tangent, offset))
     straight = np.abs(dot(tangent, looks.tangent[point])) > np.cos(np.radians(ANGLE_DEG))
     kept = straight & (np.abs(lateral) <= REACH * looks.unit) & (ahead <= 0.75 * looks.unit)
-    station = axes.alone(station[kept])
+    station = axes.alone[station[kept]]
     return Beside(point[kept], station, axes.line[station], lateral[kept]), ahead[kept]
 
 

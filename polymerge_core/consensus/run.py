@@ -216,14 +216,14 @@ def _put_together(
     base = kept.iloc[sets.base]
     # What nothing was merged into stays as it is. A scribble that turns back on itself may average out to a point: it
     # is better told by its longest look.
-    alone = np.bincount(component, minlength=len(used)) == 1
+    alone = np.diff(sets.bounds) == 1
     stay = alone | (shapely.length(shapes) <= MIN_SEGMENT_M)
     shapes = np.where(stay, base["shape"].to_numpy(dtype=object), shapes)
     known = base["sigma"].to_numpy(dtype=float)
-    stay = alone & base["is_main"].to_numpy(dtype=bool) & np.isfinite(known)
+    untouched = alone & base["is_main"].to_numpy(dtype=bool) & np.isfinite(known)
     columns = {
         "score": _scores(kept, component, seen.astype(float), expected.astype(float)),
-        "sigma_m": np.where(stay, known, sigma.astype(float)),
+        "sigma_m": np.where(untouched, known, sigma.astype(float)),
     }
     return Consensus(chosen, sets, shapes, columns, corrections), used
 
