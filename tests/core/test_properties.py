@@ -43,6 +43,20 @@ def road(rng, *, length=30.0, spacing=4.0):
     return rng.uniform(0, 60, 2) + spacing * np.cumsum(np.column_stack((np.cos(heading), np.sin(heading))), axis=0)
 
 
+def roads_far_apart(seed):
+    """Draw eight gently bent lines, 60 m apart."""
+    rng = np.random.default_rng(seed)
+    rows = [road(rng) for _ in range(8)]
+    return [shapely.LineString(points - points.min(axis=0) + (0, 60 * k)) for k, points in enumerate(rows)]
+
+
+def drawn_again(layer, direction):
+    """Return the lines of a layer, 1 as they are, -1 from their other end."""
+    copy = layer[["geometry"]].copy()
+    copy["geometry"] = [line if direction == 1 else line.reverse() for line in layer.geometry]
+    return copy
+
+
 def crossing(rng):
     """Draw the corners of a crossing, 8 to 12 m by 3 to 4 m, anywhere, turned by any angle."""
     length, width, angle = rng.uniform(8, 12), rng.uniform(3, 4), rng.uniform(0, np.pi)
@@ -343,13 +357,10 @@ class TestIdentity:
     @some(8)
     @given(seeds, st.sampled_from([1, -1]))
     def test_of_lines_twice_the_proximity_apart_merged_with_their_copy(self, seed, direction):
-        rng = np.random.default_rng(seed)
-        rows = [road(rng) for _ in range(8)]
-        lines = [shapely.LineString(points - points.min(axis=0) + (0, 60 * k)) for k, points in enumerate(rows)]
+        lines = roads_far_apart(seed)
         lines.append(shapely.LineString([(0, -50), (9, -50), (9, -40), (0, -50)]))
         layer = gpd.GeoDataFrame({"element_id": range(1, 10)}, geometry=lines)
-        copy = layer[["geometry"]].copy()
-        copy["geometry"] = [line if direction == 1 else line.reverse() for line in lines]
+        copy = drawn_again(layer, direction)
         assert wkb_of(merge(copy, layer, crs="local").elements) == wkb_of(layer)
         both = pd.concat([layer[["geometry"]].assign(instance=1), copy.assign(instance=2)])
         elements = merge(both, crs="local").elements
@@ -359,12 +370,9 @@ class TestIdentity:
     @some(8)
     @given(seeds, st.sampled_from([1, -1]))
     def test_of_gently_bent_lines_merged_with_their_copy_but_for_a_quarter_of_the_proximity(self, seed, direction):
-        rng = np.random.default_rng(seed)
-        rows = [road(rng) for _ in range(8)]
-        lines = [shapely.LineString(points - points.min(axis=0) + (0, 60 * k)) for k, points in enumerate(rows)]
+        lines = roads_far_apart(seed)
         layer = gpd.GeoDataFrame({"element_id": range(1, 9)}, geometry=lines)
-        copy = layer[["geometry"]].copy()
-        copy["geometry"] = [line if direction == 1 else line.reverse() for line in lines]
+        copy = drawn_again(layer, direction)
         elements = merge(copy, layer, crs="local").elements
         assert elements["element_id"].tolist() == layer["element_id"].tolist()
         assert elements["n_observations"].tolist() == [2] * 8
