@@ -34,6 +34,9 @@ _APART = 1e9
 #: Stations of a ring that are smoothed with it once more at either end.
 _AROUND = 30
 
+#: The share of its size that smoothing may take off a ring: a small one is little but roundness.
+_SHRUNK = 0.01
+
 
 class Feet(NamedTuple):
     """Where points fall on their own line, one entry a point."""
@@ -224,8 +227,15 @@ class Axes:
         relative = np.minimum(weight / np.median(known), _MOST) if len(known) else np.ones(len(weight))
         # A ring goes on where it ends: it is smoothed with a piece of its own to either side.
         order, series, middle = self._unrolled()
-        drawn = smooth(self.stations[order], relative[order], series, SMOOTHING)[middle]
+        drawn = smooth(self.stations[order], relative[order], series, self._smoothing[series])[middle]
         return Axes(self.around(drawn), self.line)
+
+    @property
+    def _smoothing(self) -> Array:
+        """How strongly each line is smoothed: a ring no more than leaves it its size."""
+        # Going around once is a wave that the penalty takes this much off, and the data hold with their weight of 1.
+        once = 2 * np.sin(np.pi / np.maximum(self.counts - 1, 2))
+        return np.where(self.curves.closed, np.minimum(SMOOTHING, _SHRUNK / once**6), SMOOTHING)
 
     def _unrolled(self) -> tuple[Index, Index, Index]:
         """Return the stations to smooth (of rings some once more), their lines, and where each station lies there."""
@@ -249,7 +259,7 @@ def told_apart(points: Array, line: Index) -> Array:
     return np.column_stack([points, _APART * line])
 
 
-def smooth(values: Array, weight: Array, series: Index, strength: float) -> Array:
+def smooth(values: Array, weight: Array, series: Index, strength: Array) -> Array:
     """Smooth many series at once: weighted least squares with a penalty on third differences.
 
     Parameters
@@ -260,8 +270,8 @@ def smooth(values: Array, weight: Array, series: Index, strength: float) -> Arra
         Of each value; where it is 0 the series is continued from what is around.
     series : ndarray of int, shape (n,)
         The series of each value; rising.
-    strength : float
-        Weight of the penalty.
+    strength : ndarray of float, shape (n,)
+        Weight of the penalty, that of its series at each value.
 
     Returns
     -------
@@ -274,7 +284,7 @@ def smooth(values: Array, weight: Array, series: Index, strength: float) -> Arra
     count, order = len(values), len(_DIFFERENCE) - 1
     if count <= order:
         return values
-    penalty = strength * (series[order:] == series[:-order])
+    penalty = strength[order:] * (series[order:] == series[:-order])
     # The penalty's matrix has few bands; the series do not touch in it, so all are solved as one.
     bands = np.zeros((order + 1, count))
     for row in range(order + 1):

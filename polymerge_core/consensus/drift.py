@@ -119,9 +119,9 @@ def estimate_drift(pulls: list[Pulls], unit: float) -> Drift:
     unit : float
         The proximity, metres.
     """
-    every = Pulls._make(np.concatenate(column) for column in zip(*pulls, strict=True))
-    if len(every.drive) == 0:
+    if not any(len(each.drive) for each in pulls):
         return no_drift()
+    every = Pulls._make(np.concatenate(column) for column in zip(*pulls, strict=True))
     reach = _RANGE * unit
     alike = _kernel(every.drive, every.place, every.drive, every.place, reach).tocoo()
     together = dot(every.normal[alike.row], every.normal[alike.col])

@@ -17,6 +17,7 @@ from benchmarks.scenarios import town
 from polymerge_core.consensus.alongside import pairs_alongside
 from polymerge_core.consensus.association import associate
 from polymerge_core.consensus.axes import smooth
+from polymerge_core.consensus.drift import estimate_drift
 from polymerge_core.consensus.looks import Instances, Looks
 
 CENTIMETRE = 0.01
@@ -411,7 +412,32 @@ def test_two_lines_that_fork_stay_two_where_one_local_map_saw_both():
 def test_smoothing_leaves_straight_lines_and_separate_series_alone():
     values = np.vstack([level(0, 0, 10, 1), level(50, 0, 10, 1)])
     series = np.repeat([0, 1], len(values) // 2)
-    np.testing.assert_allclose(smooth(values, np.ones(len(values)), series, 10.0), values, atol=1e-6)
+    np.testing.assert_allclose(
+        smooth(values, np.ones(len(values)), series, np.full(len(values), 10.0)), values, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("radius", [1.5, 2.0, 3.0, 6.0, 12.0])
+def test_a_small_ring_keeps_its_size(radius):
+    rng = np.random.default_rng(0)
+    angle = np.linspace(0, 2 * np.pi, 41)
+    ring = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    seen = []
+    for number in range(15):
+        turned = np.roll(ring[:-1], rng.integers(40), axis=0)
+        seen.append((np.vstack([turned, turned[:1]]) + rng.normal(0, 0.2, 2))[:: 1 if number % 2 else -1])
+    first = merge(looks(*seen))
+    again = merge(looks(*seen, drive="b"), main_map=first.as_main_map())
+    for result in (first, again):
+        (element,) = result.elements.geometry
+        assert element.is_ring
+        assert element.length == pytest.approx(LineString(ring).length, rel=0.02)
+        assert element.hausdorff_distance(LineString(ring)) < 0.25
+
+
+def test_drives_of_which_none_saw_a_line_for_certain_stay_where_they_are():
+    drift = estimate_drift([], 1.0)
+    assert (drift.at(np.array([0, 1]), np.zeros((2, 2))) == 0).all()
 
 
 def test_smoothing_bridges_what_has_no_weight():
@@ -419,7 +445,9 @@ def test_smoothing_bridges_what_has_no_weight():
     values[4, 1] = 99.0
     weight = np.ones(len(values))
     weight[4] = 0.0
-    assert smooth(values, weight, np.zeros(len(values), dtype=np.intp), 1.0)[4, 1] == pytest.approx(0, abs=1e-3)
+    assert smooth(values, weight, np.zeros(len(values), dtype=np.intp), np.ones(len(values)))[4, 1] == pytest.approx(
+        0, abs=1e-3
+    )
 
 
 # Bad and odd input
