@@ -9,6 +9,7 @@ from polymerge_core.graph import merge_network, network_layers
 from polymerge_core.io import read_layers, read_local_maps, write_layers
 from polymerge_core.merge import MergeResult, merge
 from polymerge_core.schema import LocalMaps
+from polymerge_core.store import MapStore, Update
 
 __version__ = "0.1.0"
 
@@ -17,12 +18,14 @@ __all__ = [
     "Evaluation",
     "InputError",
     "LocalMaps",
+    "MapStore",
     "MergeResult",
     "OptionError",
     "OutputError",
     "PolymergeError",
     "SchemaError",
     "State",
+    "Update",
     "accumulate",
     "evaluate",
     "merge",

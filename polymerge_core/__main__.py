@@ -20,6 +20,7 @@ from polymerge_core.evaluation import REGION_FROM
 from polymerge_core.formats import read_matrix
 from polymerge_core.job import Job, split_off
 from polymerge_core.options import AGGREGATES, INSTANCE_FROM, METHODS, Options
+from polymerge_core.streaming import run_stream
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -52,8 +53,7 @@ _run_options = _decorate(
     click.option("--watch-stdin", is_flag=True, help="Stop, leaving nothing behind, when standard input closes."),
 )
 
-_reading_options = _decorate(
-    click.option("--main-map", metavar="MAP", help="The map to merge into; its element_id are kept."),
+_source_options = _decorate(
     click.option("--class-field", help="Column of the class.  [default: class, if there is one]"),
     click.option("--class-name", default="line", show_default=True, help="The class where no column names one."),
     click.option("--drive-field", help="Column of the drive or survey.  [default: drive, else the file's name]"),
@@ -62,6 +62,11 @@ _reading_options = _decorate(
     click.option("--score-field", help="Column of the confidence, 0 to 1.  [default: score, else 1]"),
     click.option("--min-score", type=float, default=0.0, show_default=True, help="Leave out what is under it."),
     click.option("--timestamp-field", help="Column that orders the local maps.  [default: timestamp, if any]"),
+)
+
+_reading_options = _decorate(
+    click.option("--main-map", metavar="MAP", help="The map to merge into; its element_id are kept."),
+    _source_options,
     click.option(
         "--proximity", type=float, default=1.0, show_default=True, help="How near is near, in metres (Th_prox)."
     ),
@@ -262,6 +267,112 @@ def evaluate(
         click.echo(result.summary())
     if job.written:
         console.say(f"{_left_out(result.report['left_out']).removeprefix('; ') or 'done'} -> {job.written}")
+
+
+@cli.command()
+@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
+@click.argument("local_maps", nargs=-1, metavar="[LOCAL...]")
+@click.option("--create", is_flag=True, help="Make the map if there is none.")
+@click.option("--stream", is_flag=True, help="Read local maps from standard input, one JSON object a line.")
+@click.option("--draw-every", type=click.IntRange(1), default=10, show_default=True, help="Of a stream, in frames.")
+@_source_options
+@click.option("--proximity", type=float, help="Of a map that is made: how near is near, in metres.  [default: 1]")
+@click.option("--area", multiple=True, metavar="CLASS", help="Of a map that is made: a class of areas; repeatable.")
+@click.option("--crs", callback=_known_crs, help="CRS of a map that is made, and of layers without one.")
+@click.option("--strict", is_flag=True, help="A feature that cannot be used is an error.")
+@_run_options
+def update(
+    stored: Path,
+    local_maps: tuple[str, ...],
+    *,
+    create: bool,
+    stream: bool,
+    draw_every: int,
+    crs: str | None,
+    proximity: float | None,
+    area: tuple[str, ...],
+    **chosen: Any,
+) -> None:
+    """Feed the stored map MAP local maps (FILE, or FILE|layername=LAYER), all of them or none."""
+    run = split_off(chosen)
+    if stream == bool(local_maps):
+        raise click.UsageError("give local maps, or --stream to read them from standard input")
+    if stream and run["watch_stdin"]:
+        raise click.UsageError("--watch-stdin does not go with --stream, which reads standard input")
+    made = crs if create and not stored.exists() else None
+    with Job(None, local_maps, [], **run) as job:
+        held = pm.MapStore(stored, create=create, crs=made, proximity=proximity, area=area)
+        if stream:
+            report = run_stream(held, draw_every=draw_every)
+        else:
+            job.progress(0.0, "reading the files")
+            layers = pm.read_local_maps(local_maps)
+            without = any(maps.observations.crs is None for maps in layers)
+            job.progress(0.2, "updating the map")
+            report = held.update(layers, crs=crs if without else None, **chosen).report()
+        job.report(report)
+    for warning in report["warnings"]:
+        console.say(f"warning: {warning}")
+    what = ", ".join(f"{report[kind]} {kind}" for kind in ("added", "changed", "moved", "retired", "merged"))
+    console.say(
+        f"{_count(report['observations'], 'observation')} of {_count(report['instances'], 'local map')}"
+        f"{_left_out(report['left_out'])}; {_count(report['elements'], 'element')} ({what}) -> {stored}, "
+        f"revision {report['revision']}"
+    )
+
+
+@cli.command()
+@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
+@click.option("--json", "report_file", metavar="FILE", help="Write it as JSON; - for standard output.")
+def history(stored: Path, report_file: str | None) -> None:
+    """List the revisions of the stored map MAP."""
+    with Job(None, [], [], overwrite=True, report_file=report_file, progress="none", watch_stdin=False) as job:
+        revisions = pm.MapStore(stored).history()
+        job.report({"revisions": revisions.to_dict("records")})
+    if report_file is None:
+        shown = revisions.drop(columns="software")
+        click.echo(shown.to_string(index=False) if len(shown) else "no revisions")
+
+
+@cli.command()
+@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
+@click.option("--since", type=click.IntRange(0), default=0, show_default=True, help="A revision; 0 is the empty map.")
+@_output
+@_run_options
+def changes(stored: Path, output: Path, since: int, **chosen: Any) -> None:
+    """Write what became of the elements of the stored map MAP since a revision: layers changes and moves."""
+    with Job(output, [str(stored)], ["changes", "moves"], **split_off(chosen)) as job:
+        found = pm.MapStore(stored).changes(since)
+        moves = pm.MapStore(stored).moves(since)
+        job.write({"changes": found, "moves": moves}, 0.7)
+        kinds = {str(kind): int(count) for kind, count in found["kind"].value_counts(sort=False).items()}
+        job.report({"since": since, "changes": kinds})
+    listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "no changes"
+    console.say(f"{listed} -> {job.written}")
+
+
+@cli.command()
+@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
+@click.option("--revision", type=click.IntRange(1), required=True, help="Which one.")
+@_output
+@_run_options
+def restore(stored: Path, output: Path, revision: int, **chosen: Any) -> None:
+    """Write the stored map MAP as it was at a revision; MAP itself is left alone."""
+    with Job(output, [str(stored)], ["elements"], **split_off(chosen)) as job:
+        elements = pm.MapStore(stored).elements(revision)
+        job.write({"elements": elements}, 0.7)
+        job.report({"revision": revision, "elements": len(elements)})
+    console.say(f"{_count(len(elements), 'element')} of revision {revision} -> {job.written}")
+
+
+@cli.command()
+@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
+def verify(stored: Path) -> None:
+    """Check that everything that must hold of the file of the stored map MAP does."""
+    found = pm.MapStore(stored).verify()
+    if found:
+        raise pm.InputError(f"{stored} is damaged: {'; '.join(found)}; restore it from a copy")
+    console.say(f"{stored} is whole")
 
 
 @cli.command("demo")

@@ -48,7 +48,7 @@ def read_instances(observations: Observations, local_maps: Sequence[LocalMaps], 
     table = observations.table
     main = table["is_main"].to_numpy(dtype=bool)
     layer_crs = observations.layer_crs[len(observations.layer_crs) - len(local_maps) :]
-    known = [_known(maps, crs, observations.crs) for maps, crs in zip(local_maps, layer_crs, strict=True)]
+    known = [known_instances(maps, crs, observations.crs) for maps, crs in zip(local_maps, layer_crs, strict=True)]
     instances, codes = _together(table[~main], known)
     if not main.any():
         return instances, codes
@@ -81,9 +81,28 @@ def _together(table: pd.DataFrame, known: list[pd.DataFrame]) -> tuple[Instances
     return Instances(pd.factorize(every["drive"])[0], footprint, position, heading), codes
 
 
-def _known(maps: LocalMaps, layer_crs: pyproj.CRS, crs: pyproj.CRS) -> pd.DataFrame:
-    """Return drive, instance, position, heading (radians counter-clockwise from x) and footprint, in the work's CRS."""
-    columns = [*_NAMES, "x", "y", "heading", "footprint"]
+def known_instances(maps: LocalMaps, layer_crs: pyproj.CRS, crs: pyproj.CRS) -> pd.DataFrame:
+    """Return what is known of the local maps of a source, where it is known what they looked at.
+
+    Parameters
+    ----------
+    maps : LocalMaps
+        The source.
+    layer_crs, crs : pyproj.CRS
+        Of its layer, and that to return coordinates in.
+
+    Returns
+    -------
+    DataFrame
+        `drive`, `instance`, `timestamp_ns` (NaN where unknown), `x`, `y`, `heading` (radians counter-clockwise from x)
+        and `footprint`.
+
+    Raises
+    ------
+    SchemaError
+        If it cannot be told which local map a footprint is of.
+    """
+    columns = [*_NAMES, "timestamp_ns", "x", "y", "heading", "footprint"]
     frame = maps.instances
     if frame is None:
         return pd.DataFrame(columns=columns)
@@ -105,7 +124,9 @@ def _known(maps: LocalMaps, layer_crs: pyproj.CRS, crs: pyproj.CRS) -> pd.DataFr
         areas = shapely.transform(areas, lambda xy: transform_coordinates(xy, source, crs))
     heading = np.radians(90.0 - _numbers(frame, "heading"))
     named = {name: as_text(frame[name]).astype(str).to_numpy() for name in _NAMES}
-    return pd.DataFrame({**named, "x": places[:, 0], "y": places[:, 1], "heading": heading, "footprint": areas})
+    time = frame["timestamp_ns"].to_numpy(dtype=object) if "timestamp_ns" in frame else None
+    told = {"timestamp_ns": time, "x": places[:, 0], "y": places[:, 1], "heading": heading, "footprint": areas}
+    return pd.DataFrame({**named, **told})
 
 
 def _numbers(frame: pd.DataFrame, name: str) -> Array:

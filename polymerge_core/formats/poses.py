@@ -174,7 +174,24 @@ class _Entry(NamedTuple):
 
 
 def _from_json(text: str, where: str) -> Poses:
-    document = require(parse_json(text, where), list, f"{where}: the list of poses")
+    return parse_poses(require(parse_json(text, where), list, f"{where}: the list of poses"), where)
+
+
+def parse_poses(document: list[Any], where: str) -> Poses:
+    """Read poses from the objects of a parsed JSON list.
+
+    Parameters
+    ----------
+    document : list of dict
+        ``{"token", "timestamp_ns", "translation", "rotation"}`` and the like.
+    where : str
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        If an entry is no pose.
+    """
     rows = [f"{where}: pose {number}" for number in range(len(document))]
     entries = [_entry(require(entry, dict, row), row) for entry, row in zip(document, rows, strict=True)]
     tokens = _all_or_none([entry.token for entry in entries], "token", rows)

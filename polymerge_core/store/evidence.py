@@ -1,0 +1,269 @@
+"""What local maps say, as the stored map keeps it: who looked where, and what they saw."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from polymerge_core.columns import NO_TIMESTAMP
+from polymerge_core.consensus.instances import known_instances
+from polymerge_core.crs import crs_name
+from polymerge_core.curves import Index
+from polymerge_core.errors import CrsError
+from polymerge_core.observations import as_lines, observe
+from polymerge_core.options import Options
+from polymerge_core.schema import LocalMaps
+from polymerge_core.store import geopackage
+from polymerge_core.store.tables import Settings
+
+_NAMES = ["drive", "instance"]
+
+#: What the map is called beside the local maps.
+_MAP = "the stored map"
+
+
+class Evidence(NamedTuple):
+    """Local maps, in the CRS of the map.
+
+    Parameters
+    ----------
+    instances : DataFrame
+        One row a local map: `drive`, `instance`, `timestamp_ns` (None where unknown), `x`, `y`, `heading` (degrees
+        clockwise from north), `has_footprint`, `shape` (what it looked at; where that is not known the box of what it
+        saw, or None).
+    observations : DataFrame
+        One row an observation: `at` (its row in instances), `class`, `score`, `is_area`, `source`, `source_fid`,
+        `from_m`, `to_m`, `shape`.
+    left_out : DataFrame
+        What cannot be used, with reasons.
+    warnings : list of str
+        What reading them had to say.
+    """
+
+    instances: pd.DataFrame
+    observations: pd.DataFrame
+    left_out: pd.DataFrame
+    warnings: list[str]
+
+
+def read_evidence(
+    local_maps: Sequence[LocalMaps], options: Options, crs: pyproj.CRS | None
+) -> tuple[Evidence, pyproj.CRS]:
+    """Bring local maps into the terms of the stored map.
+
+    Parameters
+    ----------
+    local_maps : sequence of LocalMaps
+        One or more.
+    options : Options
+        Columns, classes and CRS.
+    crs : pyproj.CRS, optional
+        Of the map; that in which a merge would work where there is no map yet.
+
+    Returns
+    -------
+    Evidence
+        What they say.
+    pyproj.CRS
+        The CRS that it is in.
+
+    Raises
+    ------
+    CrsError
+        If the map's CRS is not true to scale where the local maps are.
+    SchemaError, InputError
+        If a layer cannot be used.
+    """
+    columns = {"element_id": pd.Series(dtype="int64"), "class": pd.Series(dtype="str")}
+    main = [] if crs is None else [LocalMaps(gpd.GeoDataFrame(columns, geometry=[], crs=crs), source=_MAP)]
+    seen = observe(list(local_maps), main, options)
+    if crs is not None and seen.crs != crs:
+        raise CrsError(
+            f"the map is in {crs_name(crs)}, which is not true to scale (0.1 %) where the local maps are; keep another "
+            "map for them"
+        )
+    table = seen.table
+    layer_crs = seen.layer_crs[len(main) :]
+    known = [known_instances(maps, each, seen.crs) for maps, each in zip(local_maps, layer_crs, strict=True)]
+    unseen = seen.left_out.loc[seen.left_out["instance"] != "", _NAMES].astype(str)
+    names = [table[_NAMES].astype(str), *(each[_NAMES] for each in known), unseen]
+    every = pd.concat(names, ignore_index=True).drop_duplicates().reset_index(drop=True)
+    index = pd.MultiIndex.from_frame(every)
+    at = index.get_indexer(pd.MultiIndex.from_frame(table[_NAMES].astype(str)))
+    shape = table["shape"].to_numpy(dtype=object)
+    observations = pd.DataFrame(
+        {
+            "at": at,
+            **{name: table[name].to_numpy() for name in ("class", "score", "is_area", "source", "from_m", "to_m")},
+            "source_fid": table["source_fid"].astype(str).to_numpy(),
+            "shape": np.where(table["is_area"] & ~table["as_polygon"], as_lines(shape), shape),
+        }
+    )
+    told = pd.concat([*known, known_instances(LocalMaps(_nothing(seen.crs)), seen.crs, seen.crs)], ignore_index=True)
+    told = told.drop_duplicates(_NAMES).set_index(_NAMES).reindex(index).reset_index(drop=True)
+    told = every.join(told)
+    earliest = pd.Series(NO_TIMESTAMP, index=every.index)
+    if len(table):
+        earliest.update(table["timestamp_ns"].groupby(at).min())
+    told["timestamp_ns"] = [
+        int(own) if own == own and own is not None else None if first == NO_TIMESTAMP else int(first)  # noqa: PLR0124
+        for own, first in zip(told["timestamp_ns"], earliest, strict=True)
+    ]
+    told["heading"] = np.mod(90.0 - np.degrees(told["heading"].to_numpy(dtype=float)), 360.0)
+    footprint = told.pop("footprint").to_numpy(dtype=object)
+    told["has_footprint"] = ~pd.isna(footprint)
+    boxes = _boxes(shape, at, len(every))
+    told["shape"] = np.where(told["has_footprint"], footprint, boxes)
+    # Of the map only the CRS was given.
+    warnings = [warning for warning in seen.notes["warnings"] if repr(_MAP) not in warning]
+    return Evidence(told, observations, seen.left_out, warnings), seen.crs
+
+
+def _nothing(crs: pyproj.CRS) -> gpd.GeoDataFrame:
+    return gpd.GeoDataFrame(geometry=[], crs=crs)
+
+
+def _boxes(shapes: NDArray[np.object_], owner: Index, count: int) -> NDArray[np.object_]:
+    """Return the box of the shapes of each owner, None of those that have none."""
+    found = np.full(count, None, dtype=object)
+    if len(shapes):
+        bounds = pd.DataFrame(shapely.bounds(shapes)).groupby(owner).agg({0: "min", 1: "min", 2: "max", 3: "max"})
+        found[bounds.index] = shapely.box(*bounds.to_numpy().T)
+    return found
+
+
+def without_known(connection: sqlite3.Connection, evidence: Evidence) -> tuple[Evidence, int]:
+    """Leave away the local maps that the map knows; return how many those are."""
+    instances = evidence.instances
+    known = np.array(
+        [
+            connection.execute("SELECT 1 FROM instances WHERE drive = ? AND instance = ?", pair).fetchone() is not None
+            for pair in zip(instances["drive"], instances["instance"], strict=True)
+        ],
+        dtype=bool,
+    )
+    if not known.any():
+        return evidence, 0
+    number = np.cumsum(~known) - 1
+    new = evidence.observations[~known[evidence.observations["at"]]]
+    pairs = pd.MultiIndex.from_frame(instances.loc[known, _NAMES])
+    own = pd.MultiIndex.from_frame(evidence.left_out[_NAMES].astype(str)).isin(pairs)
+    left = Evidence(
+        instances[~known].reset_index(drop=True),
+        new.assign(at=number[new["at"]]).reset_index(drop=True),
+        evidence.left_out[~own],
+        evidence.warnings,
+    )
+    return left, int(known.sum())
+
+
+def add(connection: sqlite3.Connection, settings: Settings, evidence: Evidence, revision: int) -> tuple[Index, Index]:
+    """Keep what local maps say; return the numbers of the local maps and of the observations in the file."""
+    first = [geopackage.next_id(connection, table) for table in ("instances", "observations")]
+    instances, observations = evidence.instances, evidence.observations
+    instance_fid = first[0] + np.arange(len(instances))
+    observation_fid = first[1] + np.arange(len(observations))
+    shapes = instances["shape"].to_numpy(dtype=object)
+    there = ~pd.isna(shapes)
+    blobs = np.full(len(shapes), None, dtype=object)
+    blobs[there] = geopackage.to_blobs(shapes[there], settings.srs_id)
+    counts = np.bincount(observations["at"], minlength=len(instances))
+    geopackage.insert(
+        connection,
+        "instances",
+        {
+            "fid": instance_fid,
+            "geom": blobs,
+            **{name: instances[name] for name in ("drive", "instance", "timestamp_ns", "x", "y", "heading")},
+            "n_observations": counts,
+            "has_footprint": instances["has_footprint"].astype(int),
+            "revision": [revision] * len(instances),
+        },
+    )
+    shapes = observations["shape"].to_numpy(dtype=object)
+    geopackage.insert(
+        connection,
+        "observations",
+        {
+            "fid": observation_fid,
+            "geom": geopackage.to_blobs(shapes, settings.srs_id),
+            "instance_fid": instance_fid[observations["at"]],
+            "is_area": observations["is_area"].astype(int),
+            **{name: observations[name] for name in ("class", "score", "source", "source_fid", "from_m", "to_m")},
+        },
+    )
+    left_out = evidence.left_out
+    columns = {name: left_out[name].astype(object) for name in left_out.columns}
+    geopackage.insert(connection, "left_out", columns | {"source_fid": left_out["source_fid"].astype(str)})
+    geopackage.touched(connection, "instances", instances["shape"].to_numpy(dtype=object)[there])
+    geopackage.touched(connection, "observations", shapes)
+    return instance_fid, observation_fid
+
+
+class Context(NamedTuple):
+    """All that is known of a place.
+
+    Parameters
+    ----------
+    instances : GeoDataFrame
+        The local maps that looked there, by `fid`, in the order of their `fid`: `drive`, `instance`, `timestamp_ns`,
+        `x`, `y`, `heading`, `has_footprint`, `revision`; geometry is what they looked at.
+    observations : GeoDataFrame
+        All that they saw, also elsewhere, by `fid`: `instance_fid`, `class`, `score`, `is_area`, `aside`.
+    """
+
+    instances: gpd.GeoDataFrame
+    observations: gpd.GeoDataFrame
+
+
+def read_context(connection: sqlite3.Connection, settings: Settings, place: shapely.Geometry) -> Context:
+    """Read what the local maps that looked at a place saw there and elsewhere."""
+    shapely.prepare(place)
+    near = geopackage.ids_near(connection, "instances", shapely.bounds(place))
+    instances = _read(connection, settings, "instances", _INSTANCE, near, "fid")
+    instances = instances[shapely.intersects(place, instances.geometry.to_numpy())]
+    observations = _read(connection, settings, "observations", _OBSERVATION, instances.index.to_numpy(), "instance_fid")
+    return Context(instances, observations)
+
+
+_INSTANCE = ("drive", "instance", "timestamp_ns", "x", "y", "heading", "has_footprint", "revision")
+_OBSERVATION = ("instance_fid", "class", "score", "is_area", "aside", "source", "source_fid", "from_m", "to_m")
+
+
+def _read(
+    connection: sqlite3.Connection, settings: Settings, table: str, columns: tuple[str, ...], ids: Index, by: str
+) -> gpd.GeoDataFrame:
+    names = ", ".join(f'"{name}"' for name in columns)
+    with geopackage.chosen(connection, ids) as these:
+        rows = connection.execute(
+            f'SELECT fid, geom, {names} FROM "{table}" WHERE "{by}" IN {these} ORDER BY fid'
+        ).fetchall()
+    held: list[list[Any]] = [list(column) for column in zip(*rows, strict=True)] or [
+        [] for _ in range(len(columns) + 2)
+    ]
+    frame = pd.DataFrame(dict(zip(columns, held[2:], strict=True)), index=pd.Index(held[0], dtype="int64", name="fid"))
+    crs = settings.crs
+    return gpd.GeoDataFrame(frame, geometry=geopackage.from_blobs(held[1]), crs=crs)
+
+
+def as_local_maps(context: Context) -> LocalMaps:
+    """Return what is known of a place as one source of local maps, features by their number in the file."""
+    instances = context.instances
+    seen = context.observations[context.observations["aside"].isna()]
+    whose = instances.loc[seen["instance_fid"]]
+    time = whose["timestamp_ns"].to_numpy(dtype=object)
+    named = {"drive": whose["drive"].to_numpy(dtype=object), "instance": whose["instance"].to_numpy(dtype=object)}
+    columns = {**named, "class": seen["class"].to_numpy(dtype=object), "score": seen["score"].to_numpy(dtype=float)}
+    if not pd.isna(time).any():
+        columns["timestamp"] = time.astype(np.int64)
+    observations = gpd.GeoDataFrame(columns, geometry=seen.geometry.to_numpy(), index=seen.index, crs=seen.crs)
+    footprints = instances[instances["has_footprint"] == 1]
+    return LocalMaps(observations, footprints, source="map")

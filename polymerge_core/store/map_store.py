@@ -1,0 +1,494 @@
+"""The stored map: one file, fed local maps for months, that can tell and undo every change."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import os
+import sqlite3
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pyproj
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from polymerge_core.consensus.alongside import REACH
+from polymerge_core.crs import is_local, is_metric, parse_crs
+from polymerge_core.errors import CrsError, InputError, OptionError, OutputError
+from polymerge_core.observations import as_lines
+from polymerge_core.options import Options
+from polymerge_core.sets import Input, as_local_maps
+from polymerge_core.store import geopackage
+from polymerge_core.store.evidence import Evidence, add, read_evidence, without_known
+from polymerge_core.store.geopackage import PATIENCE_S, connect, stamp, transaction
+from polymerge_core.store.redraw import Counts, Redraw, as_elements, read_elements
+from polymerge_core.store.tables import ELEMENT, Settings, create_map, read_settings, software
+from polymerge_core.store.verify import faults
+
+#: What a footprint or an observation is wider by than what it says of the map, proximities.
+_AROUND = REACH
+
+
+@dataclass(frozen=True)
+class Update:
+    """What an update did.
+
+    Attributes
+    ----------
+    revision : int
+        The revision that the map is at now.
+    instances, observations : int
+        Local maps and observations that are new.
+    skipped : int
+        Local maps that the map knew already.
+    added, changed, moved, retired, merged : int
+        Elements.
+    elements : int
+        Elements of the map now.
+    left_out : dict of str to int
+        Features that cannot be used, by reason.
+    warnings : list of str
+        What there is to say.
+    """
+
+    revision: int
+    instances: int
+    observations: int
+    skipped: int
+    added: int
+    changed: int
+    moved: int
+    retired: int
+    merged: int
+    elements: int
+    left_out: dict[str, int]
+    warnings: list[str]
+
+    def report(self) -> dict[str, Any]:
+        """Return it ready for JSON."""
+        return vars(self).copy()
+
+    @classmethod
+    def of(cls, revision: int, counts: Counts, elements: int, skipped: int, evidence: Evidence | None) -> Update:
+        """Return what an update did, in numbers."""
+        left_out, warnings, instances, observations = {}, [], 0, 0
+        if evidence is not None:
+            instances, observations = len(evidence.instances), len(evidence.observations)
+            reasons = evidence.left_out["reason"].value_counts(sort=False)
+            left_out = {str(reason): int(count) for reason, count in reasons.items()}
+            warnings = list(evidence.warnings)
+        if skipped:
+            warnings.append(f"{skipped} local maps were skipped: the map knows their drive and instance already")
+        done = vars(counts) | {"elements": elements, "left_out": left_out, "warnings": warnings}
+        return cls(revision, instances, observations, skipped, **done)
+
+
+_NO_CHANGE = Counts()
+
+
+class MapStore:
+    """A map in a GeoPackage, kept up to date.
+
+    QGIS, GDAL and geopandas open the file as it is: the layer `elements` is the map, beside it lie `changes` (all that
+    ever changed), `instances` and `observations` (what the map was made from), and the tables `lineage`, `left_out`,
+    `id_aliases` and `revisions`.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    create : bool, default False
+        Whether to make it where there is none, with the first update.
+    crs : any, optional
+        CRS of a map that is made: projected, in metres. By default that in which the first local maps are merged.
+    proximity : float, optional
+        Of a map that is made, as in `polymerge_core.merge`; 1 m by default.
+    area : str or sequence of str, optional
+        Of a map that is made, as in `polymerge_core.merge`.
+
+    Raises
+    ------
+    InputError
+        If there is no such file and none is to be made, or it is no stored map, or one of a later version.
+    OptionError, CrsError
+        If an option has a value that it cannot have, or is another one than the map was made with.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        create: bool = False,
+        crs: Any = None,
+        proximity: float | None = None,
+        area: str | Sequence[str] = (),
+    ) -> None:
+        self.path = Path(path)
+        self._crs = None if crs is None else parse_crs(crs)
+        self._proximity, self._area = proximity, area
+        if self._crs is not None and not is_local(self._crs) and not is_metric(self._crs):
+            raise CrsError(f"a map is kept in metres, and {self._crs.name} is not; choose a projected CRS in metres")
+        Options.of(area=area, **({} if proximity is None else {"proximity": proximity}))
+        if not self._there():
+            if not create:
+                raise InputError(f"{self.path} does not exist; a new map is made with create (--create)")
+            return
+        with self._opened("ro") as (_, settings):
+            if crs is not None and self._crs != settings.crs:
+                raise OptionError(f"{self.path} is in {settings.crs.name}; leave crs away, or make another map")
+            if proximity is not None and proximity != settings.proximity:
+                raise OptionError(
+                    f"{self.path} was made with a proximity of {settings.proximity:g} m; leave proximity away, or make "
+                    "another map"
+                )
+
+    @property
+    def crs(self) -> pyproj.CRS:
+        """CRS of the map, or that which it will be made in.
+
+        Raises
+        ------
+        InputError
+            If there is no map yet, and no CRS was given.
+        """
+        if self._there():
+            with self._opened("ro") as (_, settings):
+                return settings.crs
+        if self._crs is None:
+            raise InputError(f"{self.path} does not exist; give the CRS that it is to be made in (--crs)")
+        return self._crs
+
+    def update(self, local_maps: Input, *, draw: bool = True, **options: Any) -> Update:
+        """Add local maps to the map, all of them or none.
+
+        Local maps that the map knows already, by drive and instance, are skipped. What the new ones looked at is drawn
+        anew from all that is known of it, the rest of the map stays as it is.
+
+        Parameters
+        ----------
+        local_maps : GeoDataFrame, LocalMaps, or sequence of them
+            As in `polymerge_core.merge`.
+        draw : bool, default True
+            Whether to draw the map anew. If not, the local maps are safe in the file, and wait there to be drawn with
+            the next update that does, or with `draw`.
+        **options
+            Those of `polymerge_core.merge` that say how local maps are read: `class_field`, `class_name`,
+            `drive_field`, `instance_field`, `instance_from`, `score_field`, `min_score`, `timestamp_field`, `crs`
+            (of layers without one) and `strict`.
+
+        Returns
+        -------
+        Update
+            The revision, and what changed.
+
+        Raises
+        ------
+        InputError, SchemaError, CrsError
+            If a layer cannot be used.
+        OptionError
+            If an option has a value that it cannot have.
+        OutputError
+            If the map cannot be written; it is as it was then.
+        """
+        unknown = set(options) - _READING
+        if unknown:
+            raise OptionError(
+                f"there is no option {min(unknown)!r} here; the options are {', '.join(sorted(_READING))}"
+            )
+        layers = as_local_maps(local_maps, "local_maps")
+        new = not self._there()
+        with self._writing() as connection:
+            settings = None if new else read_settings(connection, self.path)
+            chosen = self._options(settings, options)
+            crs = self._crs if settings is None else settings.crs
+            evidence, crs = read_evidence(layers, chosen, crs)
+            if settings is None:
+                settings = create_map(connection, crs, chosen.proximity, tuple(sorted(chosen.area)))
+            return self._add(connection, settings, evidence, ", ".join(maps.source for maps in layers), draw=draw)
+
+    def draw(self) -> Update | None:
+        """Draw what waits to be drawn; return what changed, None where nothing waits.
+
+        Raises
+        ------
+        OutputError
+            If the map cannot be written; it is as it was then.
+        """
+        with self._writing() as connection:
+            settings = read_settings(connection, self.path)
+            if connection.execute("SELECT 1 FROM instances WHERE drawn IS NULL").fetchone() is None:
+                return None
+            return self._commit(connection, settings, None, "", 0, draw=True)
+
+    def elements(self, revision: int | None = None) -> gpd.GeoDataFrame:
+        """Return the map as it is, or as it was at a revision.
+
+        Parameters
+        ----------
+        revision : int, optional
+            Of `history`; the last one by default.
+
+        Returns
+        -------
+        GeoDataFrame
+            `element_id`, `class`, `score`, `n_observations`, `n_instances`, `length_m`, `sigma_m`, `first_seen`,
+            `last_seen` (texts in UTC, None where no local map has a timestamp), `state`, `evidence`; by `element_id`.
+
+        Raises
+        ------
+        OptionError
+            If there is no such revision.
+        """
+        with self._opened("ro") as (connection, settings):
+            if revision is None:
+                return read_elements(connection, settings).reset_index()
+            self._check_revision(connection, revision)
+            names = ", ".join(f'c."{name}"' for name in ELEMENT)
+            rows = connection.execute(
+                f"SELECT c.element_id, c.geom, {names} FROM changes c JOIN (SELECT element_id, MAX(fid) AS last FROM "
+                "changes WHERE revision <= ? GROUP BY element_id) l ON c.fid = l.last "
+                "WHERE c.kind NOT IN ('retired', 'merged') ORDER BY c.element_id",
+                (revision,),
+            ).fetchall()
+            return as_elements(rows, settings).reset_index()
+
+    def history(self) -> pd.DataFrame:
+        """Return the revisions: number, time, source, what was new and what changed, and who wrote it."""
+        with self._opened("ro") as (connection, _):
+            return pd.read_sql_query("SELECT * FROM revisions ORDER BY number", connection)
+
+    def changes(self, since: int = 0) -> gpd.GeoDataFrame:
+        """Return what became of each element since a revision.
+
+        Parameters
+        ----------
+        since : int, default 0
+            A revision; 0 is the empty map.
+
+        Returns
+        -------
+        GeoDataFrame
+            One row an element that is another now: `element_id`, `kind` (``added``, ``moved``, ``changed``,
+            ``retired``, ``merged``), `revision` (of the last change), `moved_m` (median distance between what it was
+            and what it is, metres), the attributes of an element, and the geometry: as it is now, or as it last was.
+        """
+        with self._opened("ro") as (connection, settings):
+            if since:
+                self._check_revision(connection, since)
+            names = ", ".join(f'"{name}"' for name in ELEMENT)
+            rows = connection.execute(
+                f"SELECT element_id, geom, {names}, kind, revision FROM changes WHERE fid IN "
+                "(SELECT MAX(fid) FROM changes WHERE revision > ? GROUP BY element_id) ORDER BY element_id",
+                (since,),
+            ).fetchall()
+        now = as_elements([row[:-2] for row in rows], settings)
+        kind = np.array([row[-2] for row in rows], dtype=object)
+        now.insert(0, "kind", kind)
+        now.insert(1, "revision", [row[-1] for row in rows])
+        before = self.elements(since).set_index("element_id") if since else now.iloc[:0]
+        was = before.geometry.reindex(now.index).to_numpy()
+        there, gone = ~pd.isna(was), np.isin(kind, ("retired", "merged"))
+        now.loc[~there & ~gone, "kind"] = "added"
+        now["moved_m"] = [
+            0.0 if one is None or lost else displacement(one, other)
+            for one, other, lost in zip(was, now.geometry, gone, strict=True)
+        ]
+        # What came and went in between is no difference.
+        return now[there | ~gone].reset_index()
+
+    def moves(self, since: int = 0) -> gpd.GeoDataFrame:
+        """Return arrows from where elements were at a revision to where they are: `element_id`, `moved_m`.
+
+        Parameters
+        ----------
+        since : int, default 0
+            A revision.
+        """
+        found = self.changes(since)
+        found = found[found["kind"] == "moved"]
+        before = self.elements(since).set_index("element_id").geometry if since else found.geometry
+        old = before.reindex(found["element_id"]).to_numpy() if since else before.to_numpy()
+        start = shapely.line_interpolate_point(as_lines(found.geometry.to_numpy()), 0.5, normalized=True)
+        arrows = shapely.reverse(shapely.shortest_line(start, as_lines(old)))
+        columns = {"element_id": found["element_id"].to_numpy(), "moved_m": found["moved_m"].to_numpy()}
+        return gpd.GeoDataFrame(columns, geometry=arrows, crs=found.crs)
+
+    def verify(self) -> list[str]:
+        """Check every invariant of the file.
+
+        Returns
+        -------
+        list of str
+            What is wrong, in sentences; none where all is right.
+        """
+        with self._opened("ro") as (connection, _):
+            return faults(connection)
+
+    def _add(
+        self, connection: sqlite3.Connection, settings: Settings, evidence: Evidence, source: str, *, draw: bool
+    ) -> Update:
+        evidence, skipped = without_known(connection, evidence)
+        if len(evidence.instances):
+            return self._commit(connection, settings, evidence, source, skipped, draw=draw)
+        (last,) = connection.execute("SELECT ifnull(MAX(number), 0) FROM revisions").fetchone()
+        if last == 0:
+            return self._commit(connection, settings, None, source, skipped, draw=False)
+        # Nothing is new: no revision either.
+        return Update.of(last, _NO_CHANGE, _count(connection, "elements"), skipped, evidence)
+
+    def _commit(
+        self,
+        connection: sqlite3.Connection,
+        settings: Settings,
+        evidence: Evidence | None,
+        source: str,
+        skipped: int,
+        *,
+        draw: bool,
+    ) -> Update:
+        """Make a revision: of what is new, of drawing, or of both."""
+        revision = geopackage.next_id(connection, "revisions")
+        if evidence is not None:
+            add(connection, settings, evidence, revision)
+        counts = _NO_CHANGE
+        if draw:
+            place = waiting(connection, settings)
+            if not place.is_empty:
+                counts = Redraw(connection, settings, place, revision).run()
+            connection.execute("UPDATE instances SET drawn = ? WHERE drawn IS NULL", (revision,))
+        update = Update.of(revision, counts, _count(connection, "elements"), skipped, evidence)
+        row = {
+            "number": revision,
+            "time": now(),
+            "source": source,
+            "n_instances": update.instances,
+            "n_observations": update.observations,
+            "n_skipped": skipped,
+            **vars(counts),
+            "elements": update.elements,
+            "software": software(),
+        }
+        geopackage.insert(connection, "revisions", {name: [value] for name, value in row.items()})
+        for table in ("revisions", "lineage", "left_out", "id_aliases"):
+            geopackage.touched(connection, table)
+        return update
+
+    def _options(self, settings: Settings | None, options: dict[str, Any]) -> Options:
+        if settings is not None:
+            return Options.of(proximity=settings.proximity, area=settings.area, **options)
+        given = {} if self._proximity is None else {"proximity": self._proximity}
+        return Options.of(area=self._area, **given, **options)
+
+    def _there(self) -> bool:
+        return self.path.exists() and self.path.stat().st_size > 0
+
+    @contextlib.contextmanager
+    def _opened(self, mode: str) -> Iterator[tuple[sqlite3.Connection, Settings]]:
+        with _told(self.path), contextlib.closing(connect(self.path, mode)) as connection:
+            yield connection, read_settings(connection, self.path)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        """Give the file within a transaction; a new file is gone again where anything fails."""
+        new = not self._there()
+        try:
+            with (
+                _told(self.path, writing=True),
+                contextlib.closing(connect(self.path, "rwc" if new else "rw")) as connection,
+            ):
+                if new:
+                    # These are no part of a transaction.
+                    stamp(connection)
+                with transaction(connection):
+                    yield connection
+        except BaseException:
+            if new:
+                self._clear_away()
+            raise
+
+    def _clear_away(self) -> None:
+        """Remove a file that no map came of."""
+        with contextlib.suppress(sqlite3.Error, OSError, InputError):
+            with contextlib.closing(connect(self.path, "ro")) as connection:
+                tables = connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0]
+            if not tables:
+                self.path.unlink()
+
+    def _check_revision(self, connection: sqlite3.Connection, revision: int) -> None:
+        (last,) = connection.execute("SELECT ifnull(MAX(number), 0) FROM revisions").fetchone()
+        if not 1 <= revision <= last:
+            raise OptionError(f"{self.path} has no revision {revision}; it has 1 to {last}")
+
+
+_READING = {
+    "class_field",
+    "class_name",
+    "drive_field",
+    "instance_field",
+    "instance_from",
+    "score_field",
+    "min_score",
+    "timestamp_field",
+    "crs",
+    "strict",
+}
+
+
+def waiting(connection: sqlite3.Connection, settings: Settings) -> BaseGeometry:
+    """Return what the local maps that wait to be drawn may say anything of: what they looked at, and what they saw."""
+    looked = "SELECT geom FROM instances WHERE drawn IS NULL AND has_footprint ORDER BY fid"
+    seen = (
+        "SELECT o.geom FROM observations o JOIN instances i ON i.fid = o.instance_fid WHERE i.drawn IS NULL "
+        "ORDER BY o.fid"
+    )
+    areas, lines = (geopackage.from_blobs([row[0] for row in connection.execute(query)]) for query in (looked, seen))
+    return shapely.union_all(np.concatenate([areas, shapely.buffer(lines, _AROUND * settings.proximity, quad_segs=2)]))
+
+
+def _count(connection: sqlite3.Connection, table: str) -> int:
+    return int(
+        connection.execute("SELECT feature_count FROM gpkg_ogr_contents WHERE table_name = ?", (table,)).fetchone()[0]
+    )
+
+
+def displacement(old: BaseGeometry, new: BaseGeometry) -> float:
+    """Return the median distance from points along the one line to the other, metres."""
+    points = shapely.line_interpolate_point(
+        new if new.geom_type != "Polygon" else new.exterior, np.linspace(0, 1, 21), normalized=True
+    )
+    return float(np.median(shapely.distance(old if old.geom_type != "Polygon" else old.exterior, points)))
+
+
+def now() -> str:
+    """Return the time as GeoPackage has it."""
+    return dt.datetime.now(dt.timezone.utc).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+
+
+@contextlib.contextmanager
+def _told(path: Path, *, writing: bool = False) -> Iterator[None]:
+    """Tell what SQLite has to say in the user's words."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        kind = OutputError if writing else InputError
+        raise kind(_explained(path, str(error), writing=writing)) from error
+
+
+def _explained(path: Path, message: str, *, writing: bool) -> str:
+    whole = "; the map is as it was" if writing else ""
+    known = {
+        "database is locked": f"{path} is in use by another program (waited {PATIENCE_S:g} s); try again",
+        "database or disk is full": f"{path}: the disk is full; make room and run the update again",
+        "attempt to write a readonly database": f"{path} cannot be written; check the permissions of file and folder",
+        "unable to open database file": f"{path} cannot be opened; check the folder and its permissions",
+        "file is not a database": f"{path} is no GeoPackage",
+        "database disk image is malformed": f"{path} is damaged; restore it from a copy",
+        "disk I/O error": f"{path}: the disk cannot be read or written",
+    }
+    return known.get(message, f"{path}: {message}") + whole
