@@ -132,7 +132,7 @@ def judge(places: Array, pairs: Index, instances: Instances, unit: float, drive:
         own = instances.drive[instance] == drive[place]
         instance, place = instance[own], place[own]
     saw = among(place * count + instance, pairs)
-    chance = _chances(places[place], instances, instance, saw, (seen >= SURE)[place], _SQUARE * unit)
+    chance = chances(places[place], instances, instance, saw, (seen >= SURE)[place], _SQUARE * unit)
     expected = np.bincount(place, chance, minlength=len(places)).astype(float)
     # A drive should have seen what one of its local maps at least should have.
     passed, inverse = np.unique(place * drives + instances.drive[instance], return_inverse=True)
@@ -143,7 +143,7 @@ def judge(places: Array, pairs: Index, instances: Instances, unit: float, drive:
     return Support(seen, expected, seen_drives, share * passes)
 
 
-def _chances(
+def chances(
     places: Array, instances: Instances, instance: Index, saw: NDArray[np.bool_], sure: NDArray[np.bool_], square: float
 ) -> Array:
     """Return how likely each local map was to see each place, by where that lies from its vehicle."""

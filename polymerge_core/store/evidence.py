@@ -12,16 +12,18 @@ import pandas as pd
 import pyproj
 import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from polymerge_core.columns import NO_TIMESTAMP
 from polymerge_core.consensus.instances import known_instances
 from polymerge_core.crs import crs_name
-from polymerge_core.curves import Index
+from polymerge_core.curves import Array, Curves, Index
 from polymerge_core.errors import CrsError
 from polymerge_core.observations import as_lines, observe
 from polymerge_core.options import Options
 from polymerge_core.schema import LocalMaps
 from polymerge_core.store import geopackage
+from polymerge_core.store.stitching import stretches_of
 from polymerge_core.store.tables import Settings
 
 _NAMES = ["drive", "instance"]
@@ -214,28 +216,36 @@ class Context(NamedTuple):
     Parameters
     ----------
     instances : GeoDataFrame
-        The local maps that looked there, by `fid`, in the order of their `fid`: `drive`, `instance`, `timestamp_ns`,
-        `x`, `y`, `heading`, `has_footprint`, `revision`; geometry is what they looked at.
+        The local maps that looked there, by `fid`: `drive`, `instance`, `timestamp_ns`, `x`, `y`, `heading`,
+        `has_footprint`, `revision`; geometry is what they looked at.
     observations : GeoDataFrame
-        All that they saw, also elsewhere, by `fid`: `instance_fid`, `class`, `score`, `is_area`, `aside`.
+        All that they saw, also elsewhere, by `fid`: `instance_fid`, `class`, `score`, `is_area`, and where they came
+        from.
+    renewed : GeoDataFrame
+        Where the road changed: `class`, `since_ns`, `since_revision`.
     """
 
     instances: gpd.GeoDataFrame
     observations: gpd.GeoDataFrame
+    renewed: gpd.GeoDataFrame
 
 
-def read_context(connection: sqlite3.Connection, settings: Settings, place: shapely.Geometry) -> Context:
+def read_context(connection: sqlite3.Connection, settings: Settings, place: BaseGeometry) -> Context:
     """Read what the local maps that looked at a place saw there and elsewhere."""
     shapely.prepare(place)
-    near = geopackage.ids_near(connection, "instances", shapely.bounds(place))
+    box = shapely.bounds(place)
+    near = geopackage.ids_near(connection, "instances", box)
     instances = _read(connection, settings, "instances", _INSTANCE, near, "fid")
     instances = instances[shapely.intersects(place, instances.geometry.to_numpy())]
     observations = _read(connection, settings, "observations", _OBSERVATION, instances.index.to_numpy(), "instance_fid")
-    return Context(instances, observations)
+    wide = shapely.total_bounds(observations.geometry.to_numpy()) if len(observations) else box
+    changed = geopackage.ids_near(connection, "renewed", wide)
+    return Context(instances, observations, _read(connection, settings, "renewed", _RENEWED, changed, "fid"))
 
 
 _INSTANCE = ("drive", "instance", "timestamp_ns", "x", "y", "heading", "has_footprint", "revision")
-_OBSERVATION = ("instance_fid", "class", "score", "is_area", "aside", "source", "source_fid", "from_m", "to_m")
+_OBSERVATION = ("instance_fid", "class", "score", "is_area", "source", "source_fid", "from_m", "to_m")
+_RENEWED = ("class", "since_ns", "since_revision")
 
 
 def _read(
@@ -249,21 +259,112 @@ def _read(
     held: list[list[Any]] = [list(column) for column in zip(*rows, strict=True)] or [
         [] for _ in range(len(columns) + 2)
     ]
-    frame = pd.DataFrame(dict(zip(columns, held[2:], strict=True)), index=pd.Index(held[0], dtype="int64", name="fid"))
-    crs = settings.crs
-    return gpd.GeoDataFrame(frame, geometry=geopackage.from_blobs(held[1]), crs=crs)
+    index = pd.Index(held[0], dtype="int64", name="fid")
+    # Numbers of 64 bits that may be missing: as floats they would lose their last digits.
+    whole = {
+        name: pd.array(values, dtype="Int64") for name, values in zip(columns, held[2:], strict=True) if name in _WHOLE
+    }
+    frame = pd.DataFrame(dict(zip(columns, held[2:], strict=True)) | whole, index=index)
+    return gpd.GeoDataFrame(frame, geometry=geopackage.from_blobs(held[1]), crs=settings.crs)
 
 
-def as_local_maps(context: Context) -> LocalMaps:
-    """Return what is known of a place as one source of local maps, features by their number in the file."""
-    instances = context.instances
-    seen = context.observations[context.observations["aside"].isna()]
-    whose = instances.loc[seen["instance_fid"]]
-    time = whose["timestamp_ns"].to_numpy(dtype=object)
-    named = {"drive": whose["drive"].to_numpy(dtype=object), "instance": whose["instance"].to_numpy(dtype=object)}
-    columns = {**named, "class": seen["class"].to_numpy(dtype=object), "score": seen["score"].to_numpy(dtype=float)}
-    if not pd.isna(time).any():
-        columns["timestamp"] = time.astype(np.int64)
-    observations = gpd.GeoDataFrame(columns, geometry=seen.geometry.to_numpy(), index=seen.index, crs=seen.crs)
-    footprints = instances[instances["has_footprint"] == 1]
-    return LocalMaps(observations, footprints, source="map")
+_WHOLE = ("timestamp_ns", "since_ns")
+
+
+class Pieces(NamedTuple):
+    """What of the observations still says something of the road.
+
+    Parameters
+    ----------
+    local_maps : LocalMaps
+        The pieces as one source of local maps, by their position.
+    footprints : ndarray of shapely geometries, shape (k,)
+        What of that which the local maps of the context looked at still says something.
+    observation : ndarray of int, shape (n,)
+        The `fid` of the observation that each is of.
+    offset : ndarray of float, shape (n,)
+        Where it begins there, metres.
+    lost : DataFrame
+        The rest: `observation_fid`, `from_m`, `to_m`, metres along the observation.
+    """
+
+    local_maps: LocalMaps
+    footprints: NDArray[np.object_]
+    observation: Index
+    offset: Array
+    lost: pd.DataFrame
+
+
+def still_valid(context: Context) -> Pieces:
+    """Take away what was seen of a class, and looked at, where the road has changed since."""
+    instances, seen = context.instances, context.observations
+    shapes = seen.geometry.to_numpy()
+    rows, lines = np.arange(len(seen)), shapes.copy()
+    offset = np.zeros(len(seen))
+    footprints = instances.geometry.to_numpy().copy()
+    cut: dict[int, BaseGeometry] = {}
+    for zone in context.renewed.itertuples():
+        before = _before(instances, zone)
+        near = before & shapely.intersects(footprints, zone.geometry)
+        footprints[near] = shapely.difference(footprints[near], zone.geometry)
+        own = before[instances.index.get_indexer(seen["instance_fid"])] & (seen["class"] == zone[1]).to_numpy()
+        for row in np.flatnonzero(own & shapely.intersects(shapes, zone.geometry)).tolist():
+            cut[row] = shapely.union(cut[row], zone.geometry) if row in cut else zone.geometry
+    lost: list[tuple[int, float, float]] = []
+    if cut:
+        kept = np.setdiff1d(rows, list(cut))
+        area = seen["is_area"].to_numpy(dtype=bool)
+        parts = [_rest(shapes[row], zone, is_area=bool(area[row])) for row, zone in sorted(cut.items())]
+        whose = np.repeat(sorted(cut), [len(part) for part in parts]).astype(np.intp)
+        bounds = np.array([bound for part in parts for bound in part], dtype=np.float64).reshape(-1, 2)
+        whole = area[whose]
+        pieces = shapes[whose].copy()
+        if (~whole).any():
+            curves = Curves(shapes[whose[~whole]])
+            every = np.arange(len(curves))
+            pieces[~whole] = curves.stretches(every, *bounds[~whole].T)
+        rows, lines = np.concatenate([kept, whose]), np.concatenate([shapes[kept], pieces])
+        offset = np.concatenate([np.zeros(len(kept)), bounds[:, 0]])
+        lost = [
+            (int(seen.index[row]), *gap)
+            for row, part in zip(sorted(cut), parts, strict=True)
+            for gap in _gaps(part, float(as_lines(shapes[row : row + 1])[0].length))
+        ]
+    own = seen.iloc[rows]
+    whose = instances.index.get_indexer(own["instance_fid"])
+    columns = {name: instances[name].to_numpy(dtype=object)[whose] for name in _NAMES}
+    columns |= {"class": own["class"].to_numpy(dtype=object), "score": own["score"].to_numpy(dtype=float)}
+    time = instances["timestamp_ns"]
+    if not time.isna().any():
+        columns["timestamp"] = time.to_numpy(dtype=np.int64)[whose]
+    observations = gpd.GeoDataFrame(columns, geometry=lines, crs=seen.crs)
+    known = instances.assign(geometry=footprints)[(instances["has_footprint"] == 1).to_numpy()]
+    table = pd.DataFrame(lost, columns=["observation_fid", "from_m", "to_m"])
+    return Pieces(LocalMaps(observations, known, source="map"), footprints, own.index.to_numpy(), offset, table)
+
+
+def _before(instances: gpd.GeoDataFrame, zone: Any) -> NDArray[np.bool_]:
+    """Tell which local maps were taken before the road changed."""
+    time = instances["timestamp_ns"]
+    earlier = (instances["revision"] < zone.since_revision).to_numpy(dtype=bool, copy=True)
+    if pd.isna(zone.since_ns):
+        return earlier
+    known = time.notna().to_numpy()
+    earlier[known] = (time[known] < zone.since_ns).to_numpy(dtype=bool)
+    return earlier
+
+
+def _rest(shape: BaseGeometry, zone: BaseGeometry, *, is_area: bool) -> list[tuple[float, float]]:
+    """Return the stretches of a line outside of a zone; an area is in it for the most part, or not at all."""
+    if is_area:
+        ring = as_lines(np.array([shape], dtype=object))[0]
+        area = shapely.make_valid(shapely.polygons(shapely.get_coordinates(ring)))
+        inside = shapely.area(shapely.intersection(area, zone)) > shapely.area(area) / 2
+        return [] if inside else [(0.0, float(ring.length))]
+    return [(each.start, each.stop) for each in stretches_of(shape, zone, inside=False)]
+
+
+def _gaps(parts: list[tuple[float, float]], length: float) -> list[tuple[float, float]]:
+    """Return what lies between the parts of a line."""
+    edges = [0.0, *(bound for part in parts for bound in part), length]
+    return [(start, stop) for start, stop in zip(edges[::2], edges[1::2], strict=True) if stop > start]

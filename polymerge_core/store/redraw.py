@@ -21,13 +21,20 @@ from shapely.geometry.base import BaseGeometry
 
 from polymerge_core.consensus.run import UNSUPPORTED
 from polymerge_core.curves import Array, Index
-from polymerge_core.merge import MergeResult, merge
+from polymerge_core.merge import merge
 from polymerge_core.observations import as_lines
 from polymerge_core.schema import NO_ELEMENT
 from polymerge_core.store import geopackage
-from polymerge_core.store.evidence import Context, as_local_maps, read_context
+from polymerge_core.store.beliefs import SURE_OF, judge_elements
+from polymerge_core.store.evidence import Context, Pieces, read_context, still_valid
 from polymerge_core.store.stitching import Chain, Piece, cut_at, put_together, shares
 from polymerge_core.store.tables import ELEMENT, Settings
+
+#: Why a piece of an observation is in no element.
+RENEWED = "the road changed since"
+
+#: The place is looked over so often for changes: what one hides may show then.
+_RENEWALS = 2
 
 #: What cutting at the edge of a place leaves of a line, with nothing to join, is no line up to this long, proximities.
 _REST = 3.0
@@ -42,6 +49,16 @@ class Counts:
     moved: int = 0
     retired: int = 0
     merged: int = 0
+
+
+class Merged(NamedTuple):
+    """What a merge of the place gives, in the terms of the file."""
+
+    elements: gpd.GeoDataFrame
+    #: `row` of the element, `piece`, `observation_fid`, and from where to where along the observation.
+    lineage: pd.DataFrame
+    left_out: pd.DataFrame
+    pieces: Pieces
 
 
 class Shape(NamedTuple):
@@ -84,8 +101,14 @@ class Redraw:
         stored = self._stored()
         area = self._is_area(stored)
         whole = shapely.box(*shapely.bounds(stored.geometry.to_numpy()[area]).T) if area.any() else np.empty(0, object)
-        context = read_context(self.connection, self.settings, shapely.union_all([self.place, *whole]))
+        context_place = shapely.union_all([self.place, *whole])
+        context = read_context(self.connection, self.settings, context_place)
         merged = self._merge(context)
+        rounds = 0
+        while self._judge(context, merged) and rounds < _RENEWALS:
+            rounds += 1
+            context = read_context(self.connection, self.settings, context_place)
+            merged = self._merge(context)
         before = self._lineage(context)
         shapes = self._shapes(merged.elements, stored)
         votes = _votes(merged, context, before)
@@ -113,9 +136,49 @@ class Redraw:
         polygon = shapely.get_type_id(elements.geometry.to_numpy()) == shapely.GeometryType.POLYGON
         return np.asarray(polygon | elements["class"].isin(self.settings.area).to_numpy())
 
-    def _merge(self, context: Context) -> MergeResult:
+    def _merge(self, context: Context) -> Merged:
+        """Merge all that still says something of the place."""
         settings = self.settings
-        return merge(as_local_maps(context), proximity=settings.proximity, area=settings.area)
+        pieces = still_valid(context)
+        result = merge(pieces.local_maps, proximity=settings.proximity, area=settings.area)
+        tables = []
+        for table in (result.lineage, result.left_out):
+            row = table["source_fid"].to_numpy(dtype=np.intp)
+            shift = pieces.offset[row]
+            own = {"piece": row, "observation_fid": pieces.observation[row]}
+            tables.append(table.assign(**own, from_m=table["from_m"] + shift, to_m=table["to_m"] + shift))
+        lineage, left_out = tables
+        lineage["row"] = np.searchsorted(result.elements["element_id"], lineage["element_id"])
+        left_out = pd.concat([left_out, pieces.lost.assign(reason=RENEWED)], ignore_index=True)
+        return Merged(result.elements, lineage, left_out, pieces)
+
+    def _judge(self, context: Context, merged: Merged) -> bool:
+        """Say how sure elements are, and set aside what was known before where the road changed; tell if it did."""
+        seen = merged.pieces.local_maps.observations
+        whose = context.observations["instance_fid"].reindex(merged.pieces.observation)
+        observations = seen.assign(instance=context.instances.index.get_indexer(whose))
+        instances = context.instances.assign(geometry=merged.pieces.footprints)
+        lineage = merged.lineage[["row", "piece"]].rename(columns={"row": "element", "piece": "observation"})
+        judged = judge_elements(merged.elements, lineage, observations, instances, self.place, self.settings.proximity)
+        merged.elements["evidence"] = judged.evidence
+        if not judged.renewals:
+            return False
+        first = context.instances.iloc[[renewal.since for renewal in judged.renewals]]
+        shapes = np.array([renewal.zone for renewal in judged.renewals], dtype=object)
+        geopackage.insert(
+            self.connection,
+            "renewed",
+            {
+                "geom": geopackage.to_blobs(shapes, self.settings.srs_id),
+                "class": [renewal.cls for renewal in judged.renewals],
+                "kind": [renewal.kind for renewal in judged.renewals],
+                "since_ns": [None if pd.isna(time) else int(time) for time in first["timestamp_ns"]],
+                "since_revision": first["revision"],
+                "revision": [self.revision] * len(shapes),
+            },
+        )
+        geopackage.touched(self.connection, "renewed", shapes)
+        return True
 
     def _lineage(self, context: Context) -> pd.DataFrame:
         """Return which intervals of the observations of the context are in which element."""
@@ -179,7 +242,7 @@ class Redraw:
     def _attribute(
         self,
         context: Context,
-        merged: MergeResult,
+        merged: Merged,
         stored: gpd.GeoDataFrame,
         shapes: list[Shape],
         ids: NDArray[np.int64],
@@ -187,17 +250,16 @@ class Redraw:
         gone: dict[int, int],
     ) -> None:
         """Write what the observations that meet the place went into."""
-        held = context.observations[context.observations["aside"].isna()]
+        held = context.observations
         drawn = _by_piece(shapes, "new").drop_duplicates(["row", "shape"])
-        ids_drawn = merged.elements["element_id"].to_numpy()[drawn["row"].unique()]
-        theirs = merged.lineage.loc[merged.lineage["element_id"].isin(ids_drawn), "source_fid"]
         meets = shapely.intersects(self.place, held.geometry.to_numpy())
+        theirs = merged.lineage.loc[merged.lineage["row"].isin(drawn["row"]), "observation_fid"]
         here = held.index[meets | held.index.isin(theirs)]
-        lineage = merged.lineage[merged.lineage["source_fid"].isin(here)]
+        lineage = merged.lineage[merged.lineage["observation_fid"].isin(here)]
         # A merged element that is not drawn here is that stored one which it has most in common with.
         best = votes.sort_values(["length", "element_id"], ascending=[False, True]).drop_duplicates("row")
         stands_for = best.set_index("row")["element_id"].replace(gone)
-        row = merged.elements.index[np.searchsorted(merged.elements["element_id"], lineage["element_id"])].to_numpy()
+        row = lineage["row"].to_numpy()
         element = pd.Series(row).map(stands_for).fillna(NO_ELEMENT).to_numpy(dtype=np.int64, copy=True)
         left = _by_piece(shapes, "old")
         left["element_id"] = stored.index.to_numpy()[left["row"]]
@@ -213,16 +275,16 @@ class Redraw:
                 nearest = np.argmin(np.round(far, 6), axis=0)
             element[rows] = ids[places[nearest]]
         lost = element == NO_ELEMENT
-        left_out = merged.left_out[merged.left_out["source_fid"].isin(here)]
+        left_out = merged.left_out[merged.left_out["observation_fid"].isin(here)]
         left_out = pd.concat([left_out, lineage[lost].assign(reason=UNSUPPORTED)], ignore_index=True)
         with geopackage.chosen(self.connection, here.to_numpy()) as these:
             for table in ("lineage", "left_out"):
                 self.connection.execute(f"DELETE FROM {table} WHERE observation_fid IN {these}")
-        kept = _intervals(held, lineage[~lost])
+        kept = _intervals(context, lineage[~lost])
         geopackage.insert(
             self.connection, "lineage", kept | {"element_id": element[~lost], "weight": lineage["weight"][~lost]}
         )
-        geopackage.insert(self.connection, "left_out", _intervals(held, left_out) | {"reason": left_out["reason"]})
+        geopackage.insert(self.connection, "left_out", _intervals(context, left_out) | {"reason": left_out["reason"]})
         for old, now in sorted(gone.items()):
             if now == NO_ELEMENT:
                 names = "source, source_fid, drive, instance, from_m, to_m"
@@ -268,7 +330,7 @@ class Redraw:
         table = pd.DataFrame(index=pd.Index(ids, name="element_id"), columns=list(ELEMENT))
         table["class"] = [shape.cls for shape in shapes]
         table["length_m"] = shapely.length(lines)
-        for name in ("score", "sigma_m"):
+        for name in ("score", "sigma_m", "evidence"):
             table[name] = [_value(shape, merged[name], stored[name]) for shape in shapes]
         return gpd.GeoDataFrame(table, geometry=lines, crs=self.settings.crs)
 
@@ -287,7 +349,7 @@ class Redraw:
             elements[name] = counted[name].fillna(0).to_numpy(dtype=np.int64)
         for name in ("first_seen", "last_seen"):
             elements[name] = as_time(counted[name])
-        elements["state"] = np.where(elements["n_instances"] >= CONFIRMED, "confirmed", "tentative")
+        elements["state"] = np.where(elements["evidence"].astype(float) >= SURE_OF, "confirmed", "tentative")
 
     def _write(self, now: gpd.GeoDataFrame, was: gpd.GeoDataFrame, gone: dict[int, int]) -> None:
         """Write the elements that changed, and what changed."""
@@ -333,10 +395,6 @@ class Redraw:
                 **{name: elements[name] for name in ELEMENT},
             },
         )
-
-
-#: So many local maps make sure of an element.
-CONFIRMED = 3
 
 
 def read_elements(connection: sqlite3.Connection, settings: Settings, ids: Index | None = None) -> gpd.GeoDataFrame:
@@ -402,19 +460,11 @@ def _by_piece(shapes: list[Shape], kind: str) -> pd.DataFrame:
     )
 
 
-def _votes(merged: MergeResult, context: Context, before: pd.DataFrame) -> pd.DataFrame:
+def _votes(merged: Merged, context: Context, before: pd.DataFrame) -> pd.DataFrame:
     """Return how much each merged element (`row`) has in common with each stored one (`element_id`): `length`."""
-    lineage = merged.lineage
-    row = np.searchsorted(merged.elements["element_id"], lineage["element_id"])
-    own = context.observations["from_m"].reindex(lineage["source_fid"]).to_numpy(dtype=float)
-    now = pd.DataFrame(
-        {
-            "observation_fid": lineage["source_fid"].to_numpy(),
-            "row": row,
-            "start": lineage["from_m"].to_numpy() + own,
-            "stop": lineage["to_m"].to_numpy() + own,
-        }
-    )
+    now = merged.lineage[["observation_fid", "row"]]
+    own = context.observations["from_m"].reindex(now["observation_fid"]).to_numpy(dtype=float)
+    now = now.assign(start=merged.lineage["from_m"] + own, stop=merged.lineage["to_m"] + own)
     both = now.merge(before, on="observation_fid")
     length = np.minimum(both["stop"], both["to_m"]) - np.maximum(both["start"], both["from_m"])
     both = both.assign(length=length.astype(np.float64))[(length > 0).to_numpy()]
@@ -424,7 +474,7 @@ def _votes(merged: MergeResult, context: Context, before: pd.DataFrame) -> pd.Da
 
 def _middles(observations: gpd.GeoDataFrame, intervals: pd.DataFrame) -> NDArray[np.object_]:
     """Return the point in the middle of each interval of an observation."""
-    lines = as_lines(observations.geometry.reindex(intervals["source_fid"]).to_numpy())
+    lines = as_lines(observations.geometry.reindex(intervals["observation_fid"]).to_numpy())
     at = (intervals["from_m"] + intervals["to_m"]).to_numpy(dtype=float) / 2
     points: NDArray[np.object_] = shapely.line_interpolate_point(lines, at)
     return points
@@ -435,16 +485,17 @@ def _middle(shapes: NDArray[np.object_]) -> NDArray[np.object_]:
     return points
 
 
-def _intervals(observations: gpd.GeoDataFrame, intervals: pd.DataFrame) -> dict[str, Iterable[Any]]:
+def _intervals(context: Context, intervals: pd.DataFrame) -> dict[str, Iterable[Any]]:
     """Return intervals of observations as intervals of the features that these came from."""
-    fid = intervals["source_fid"].to_numpy(dtype=np.int64)
-    own = observations.loc[fid]
+    fid = intervals["observation_fid"].to_numpy(dtype=np.int64)
+    own = context.observations.loc[fid]
+    whose = context.instances.loc[own["instance_fid"]]
     start = own["from_m"].to_numpy(dtype=float)
     return {
         "source": own["source"],
         "source_fid": own["source_fid"],
-        "drive": intervals["drive"],
-        "instance": intervals["instance"],
+        "drive": whose["drive"],
+        "instance": whose["instance"],
         "from_m": start + intervals["from_m"].to_numpy(dtype=float),
         "to_m": start + intervals["to_m"].to_numpy(dtype=float),
         "observation_fid": fid,

@@ -78,7 +78,16 @@ def cut_at(lines: NDArray[np.object_], place: BaseGeometry, *, inside: bool, new
     return pieces
 
 
-def _cut(line: BaseGeometry, place: BaseGeometry, *, inside: bool) -> list[tuple[BaseGeometry, tuple[bool, bool]]]:
+class Stretch(NamedTuple):
+    """A stretch of a line, metres from its start, and whether its ends lie on the edge of the place."""
+
+    start: float
+    stop: float
+    cut: tuple[bool, bool]
+
+
+def stretches_of(line: BaseGeometry, place: BaseGeometry, *, inside: bool) -> list[Stretch]:
+    """Return the stretches of a line that lie inside a place, or outside of it; of a ring as of an open line."""
     crossings = shapely.points(shapely.get_coordinates(shapely.intersection(line, shapely.boundary(place))))
     length = float(line.length)
     places = np.concatenate([[0.0], np.sort(shapely.line_locate_point(line, crossings)), [length]])
@@ -86,32 +95,29 @@ def _cut(line: BaseGeometry, place: BaseGeometry, *, inside: bool) -> list[tuple
     places[-1] = length
     if len(places) < 2:
         return []
+    middle = shapely.line_interpolate_point(line, (places[:-1] + places[1:]) / 2)
+    here = shapely.intersects(place, middle) == inside
+    return [
+        Stretch(float(places[first]), float(places[last + 1]), (first > 0, last < len(here) - 1))
+        for first, last in _runs(here)
+        if places[last + 1] - places[first] > _NOTHING
+    ]
+
+
+def _cut(line: BaseGeometry, place: BaseGeometry, *, inside: bool) -> list[tuple[BaseGeometry, tuple[bool, bool]]]:
+    found = stretches_of(line, place, inside=inside)
+    if not found:
+        return []
     curves = Curves(np.array([line], dtype=object))
-    middle = curves.points_at(np.zeros(len(places) - 1, np.intp), (places[:-1] + places[1:]) / 2)
-    here = shapely.intersects(place, shapely.points(middle)) == inside
-    runs = _runs(here)
-    bounds = [(places[first], places[last + 1]) for first, last in runs]
-    ends = [(first > 0, last < len(here) - 1) for first, last in runs]
+    start, stop = (np.array([getattr(each, name) for each in found]) for name in ("start", "stop"))
+    lines = list(curves.stretches(np.zeros(len(found), np.intp), start, stop))
+    ends = [each.cut for each in found]
     # A ring goes on where it ends.
-    around = bool(curves.closed[0]) and len(runs) > 1 and here[0] and here[-1]
-    if around:
-        bounds[0] = (bounds[-1][0], length + bounds[0][1])
-        bounds, ends = bounds[:-1], [(True, True), *ends[1:-1]]
-    found = []
-    for (start, stop), cut in zip(bounds, ends, strict=True):
-        if stop - start > _NOTHING:
-            found.append((_stretch(curves, start, stop, length), cut))
-    return found
-
-
-def _stretch(curves: Curves, start: float, stop: float, length: float) -> BaseGeometry:
-    """Return a stretch of the one line; of a ring also over its first vertex."""
-    row = np.zeros(1, np.intp)
-    if stop <= length:
-        return curves.stretches(row, np.array([start]), np.array([stop]))[0]
-    before = shapely.get_coordinates(curves.stretches(row, np.array([start]), np.array([length]))[0])
-    after = shapely.get_coordinates(curves.stretches(row, np.array([0.0]), np.array([stop - length]))[0])
-    return shapely.linestrings(np.vstack([before, after[1:]]))
+    if curves.closed[0] and len(found) > 1 and not ends[0][0] and not ends[-1][1]:
+        joined = np.vstack([shapely.get_coordinates(lines[-1]), shapely.get_coordinates(lines[0])[1:]])
+        lines = [shapely.linestrings(joined), *lines[1:-1]]
+        ends = [(True, True), *ends[1:-1]]
+    return list(zip(lines, ends, strict=True))
 
 
 def _runs(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -71,12 +71,15 @@ _LAYERS = {
             "source_fid": "TEXT",
             "from_m": "REAL",
             "to_m": "REAL",
-            "aside": "INTEGER",
         },
         "GEOMETRY",
     ),
     # Where the road is known to have changed: what was seen of the class there before says nothing of it now.
-    "renewed": ("fid", {"class": "TEXT", "since": "TEXT", "revision": "INTEGER"}, "GEOMETRY"),
+    "renewed": (
+        "fid",
+        {"class": "TEXT", "kind": "TEXT", "since_ns": "INTEGER", "since_revision": "INTEGER", "revision": "INTEGER"},
+        "GEOMETRY",
+    ),
 }
 
 _TABLES = {

@@ -1,0 +1,353 @@
+"""What local maps say of an element over time: whether it is there, and whether the road has changed.
+
+Each local map that looked at a place speaks for what it saw there and against what it did not see, as strongly as its
+predictor is likely to see it from there and unlikely to imagine it (log-odds; Moravec and Elfes 1985). A drive is heard
+once, however many frames it has: a parked van hides a line from all of them. Over the drives, in the order of time, the
+likeliest story is chosen: it was always there, it never was, it came at one time, it went at one time; a change must
+explain what was seen better by as much as changes are rare. What lies aside from what earlier drives saw is judged
+alike: one line, or one before and another after.
+
+References
+----------
+Moravec and Elfes 1985, "High resolution maps from wide angle sonar"; Page 1954, "Continuous inspection schemes".
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
+
+from polymerge_core.consensus.alongside import REACH
+from polymerge_core.consensus.looks import Instances
+from polymerge_core.consensus.support import SURE, chances
+from polymerge_core.curves import Array, Curves, Index, count_up
+from polymerge_core.observations import as_lines
+
+#: The chance that a local map shows something of a class at a place where there is nothing of it.
+FALSE_ALARM = 0.05
+
+#: The chance that a line is seen from where it should be is learned from the lines that are sure, within these bounds.
+DETECTION = (0.2, 0.95)
+
+#: The chance where it is not known what local maps look at.
+_USUAL = 0.7
+
+#: What all frames of a drive say together counts at most this much: log-odds, 20 to 1.
+DRIVE = 3.0
+
+#: The chance that a place changes between two drives.
+CHANGE = 0.01
+
+#: From these log-odds on an element is sure, 20 to 1.
+SURE_OF = 3.0
+
+#: Places along lines are judged at steps of so many proximities.
+_STEP = 2.0
+
+#: What changes is at least so many proximities long, or all of an element; what is shorter is a matter of its ends.
+_SHORTEST = 8.0
+
+#: Shorter gaps in what has changed are no gaps, proximities.
+_BRIDGED = 6.0
+
+#: Drives are taken to be at least this far apart in what they say of a line, proximities.
+_LEAST = 0.1
+
+_SQUARE = 5.0
+_COST = -np.log(CHANGE)
+
+
+class Places(NamedTuple):
+    """Places along elements, at which these are judged; one entry a place, element by element."""
+
+    element: Index
+    points: Array
+    #: Direction to the left of the element; NaN for areas, which have one place.
+    normal: Array
+
+
+class Renewal(NamedTuple):
+    """Somewhere the road changed."""
+
+    cls: str
+    #: ``vanished``, ``appeared`` or ``moved``.
+    kind: str
+    zone: BaseGeometry
+    #: The first local map of the first drive that saw the change.
+    since: int
+
+
+class Judgement(NamedTuple):
+    """What is known of elements.
+
+    Parameters
+    ----------
+    evidence : ndarray of float, shape (m,)
+        Log-odds that each is there; NaN where nobody looked.
+    renewals : list of Renewal
+        Where the road changed.
+    """
+
+    evidence: Array
+    renewals: list[Renewal]
+
+
+def judge_elements(
+    elements: gpd.GeoDataFrame,
+    lineage: pd.DataFrame,
+    observations: gpd.GeoDataFrame,
+    instances: gpd.GeoDataFrame,
+    place: BaseGeometry,
+    unit: float,
+) -> Judgement:
+    """Judge elements by all local maps that looked at a place.
+
+    Parameters
+    ----------
+    elements : GeoDataFrame
+        As merged: `class`.
+    lineage : DataFrame
+        `element` (row), `observation` (row) of what was merged.
+    observations : GeoDataFrame
+        `instance` (row), `class`.
+    instances : GeoDataFrame
+        The local maps: `drive`, `timestamp_ns`, `revision`, `x`, `y`, `heading`, `has_footprint`; geometry is what they
+        looked at, as far as that still counts.
+    place : Polygon or MultiPolygon
+        Where all that looked is known.
+    unit : float
+        The proximity, metres.
+    """
+    places = _places(elements, place, unit)
+    drive, order = drives_in_order(instances)
+    seen = _sightings(places, elements, lineage, observations, unit)
+    stories = _stories(places, seen, instances, drive, len(order), unit)
+    total = stories.sum(axis=1)
+    evidence = pd.Series(total).groupby(places.element).median().reindex(range(len(elements))).to_numpy(dtype=float)
+    if len(order) < 2:
+        return Judgement(evidence, [])
+    renewals = _came_or_went(places, elements, stories, order, unit)
+    return Judgement(evidence, renewals + _moved(places, elements, seen, observations, drive, order, unit))
+
+
+def drives_in_order(instances: gpd.GeoDataFrame) -> tuple[Index, Index]:
+    """Return the drive of each local map by its place in time, and the first local map (row) of each drive."""
+    held = pd.DataFrame(
+        {
+            "drive": instances["drive"].to_numpy(),
+            "time": instances["timestamp_ns"].astype("Float64").fillna(np.inf).to_numpy(dtype=float),
+            "revision": instances["revision"].to_numpy(),
+            "row": np.arange(len(instances)),
+        }
+    )
+    first = held.sort_values(["time", "revision", "row"]).drop_duplicates("drive").reset_index(drop=True)
+    number = pd.Series(first.index, index=first["drive"])
+    return number.reindex(held["drive"]).to_numpy(dtype=np.intp), first["row"].to_numpy(dtype=np.intp)
+
+
+def _places(elements: gpd.GeoDataFrame, place: BaseGeometry, unit: float) -> Places:
+    shapes = elements.geometry.to_numpy()
+    area = shapely.get_type_id(shapes) == shapely.GeometryType.POLYGON
+    rows = np.flatnonzero(~area)
+    curves = Curves(shapes[rows])
+    steps = np.maximum(np.round(curves.length / (_STEP * unit)), 1).astype(np.intp)
+    line, number = count_up(steps)
+    position = (number + 0.5) * (curves.length / steps)[line]
+    points = curves.points_at(line, position)
+    half = 0.5 * unit
+    chord = curves.points_at(line, position + half) - curves.points_at(line, position - half)
+    chord /= np.maximum(np.hypot(*chord.T), np.finfo(float).tiny)[:, None]
+    centres = shapely.get_coordinates(shapely.centroid(shapes[area])).reshape(-1, 2)
+    every = np.concatenate([points, centres])
+    owner = np.concatenate([rows[line], np.flatnonzero(area)])
+    normal = np.concatenate([np.column_stack([-chord[:, 1], chord[:, 0]]), np.full(centres.shape, np.nan)])
+    inside = shapely.intersects(place, shapely.points(every)) if len(every) else np.empty(0, dtype=bool)
+    order = np.flatnonzero(inside)[np.argsort(owner[inside], kind="stable")]
+    return Places(owner[order], every[order], normal[order])
+
+
+def _sightings(
+    places: Places, elements: gpd.GeoDataFrame, lineage: pd.DataFrame, observations: gpd.GeoDataFrame, unit: float
+) -> pd.DataFrame:
+    """Return who saw what: `place`, `observation`, `instance`, and whether it is of that element, `own`."""
+    shapes = observations.geometry.to_numpy()
+    points = shapely.points(places.points)
+    tree = shapely.STRtree(points)
+    row, place = tree.query(as_lines(shapes), predicate="dwithin", distance=REACH * unit)
+    pairs = set(zip(lineage["observation"].tolist(), lineage["element"].tolist(), strict=True))
+    own = np.array(
+        [pair in pairs for pair in zip(row.tolist(), places.element[place].tolist(), strict=True)], dtype=bool
+    )
+    cls = elements["class"].to_numpy()[places.element[place]] == observations["class"].to_numpy()[row]
+    near = np.zeros(len(row), dtype=bool)
+    near[cls] = shapely.dwithin(as_lines(shapes[row[cls]]), points[place[cls]], unit)
+    kept = own | near
+    found = pd.DataFrame({"place": place[kept], "observation": row[kept], "own": own[kept]})
+    # An area is seen by whoever saw any of it.
+    areas = np.flatnonzero(np.isnan(places.normal[:, 0]))
+    whole = lineage.merge(pd.DataFrame({"element": places.element[areas], "place": areas}), on="element")
+    found = pd.concat([found, whole[["place", "observation"]].assign(own=True)], ignore_index=True)
+    found = found.sort_values("own", ascending=False, kind="stable").drop_duplicates(["place", "observation"])
+    found["instance"] = observations["instance"].to_numpy()[found["observation"]]
+    return found.astype({"place": np.intp, "observation": np.intp, "instance": np.intp})
+
+
+def _stories(
+    places: Places, seen: pd.DataFrame, instances: gpd.GeoDataFrame, drive: Index, drives: int, unit: float
+) -> Array:
+    """Return what each drive says of each place: log-odds, shape (places, drives)."""
+    footprints = instances.geometry.to_numpy()[:]
+    known = instances["has_footprint"].to_numpy(dtype=bool)
+    tree = shapely.STRtree(shapely.points(places.points))
+    who = np.flatnonzero(known)
+    shapely.prepare(footprints[who])
+    row, looked_at = tree.query(footprints[who], predicate="contains")
+    looked = pd.DataFrame({"place": looked_at, "instance": who[row]}).astype(np.intp)
+    sightings = seen[["place", "instance"]].drop_duplicates()
+    saw = pd.MultiIndex.from_frame(looked).isin(pd.MultiIndex.from_frame(sightings))
+    position = instances[["x", "y"]].to_numpy(dtype=float)
+    heading = np.radians(90.0 - instances["heading"].to_numpy(dtype=float))
+    frames = Instances(drive, None, position, heading)
+    times = np.bincount(looked["place"][saw], minlength=len(places.points))
+    sure = (times >= SURE)[looked["place"]]
+    points = places.points[looked["place"]]
+    likely = chances(points, frames, looked["instance"].to_numpy(), saw, sure, _SQUARE * unit)
+    likely = np.clip(likely, *DETECTION)
+    said = np.where(saw, np.log(likely / FALSE_ALARM), np.log((1 - likely) / (1 - FALSE_ALARM)))
+    total = np.zeros((len(places.points), drives))
+    np.add.at(total, (looked["place"].to_numpy(), drive[looked["instance"]]), said)
+    # Who saw it without being known to have looked.
+    inside = pd.MultiIndex.from_frame(sightings).isin(pd.MultiIndex.from_frame(looked))
+    others = sightings[~inside]
+    np.add.at(total, (others["place"].to_numpy(), drive[others["instance"]]), np.log(_USUAL / FALSE_ALARM))
+    return np.clip(total, -DRIVE, DRIVE)
+
+
+def _came_or_went(
+    places: Places, elements: gpd.GeoDataFrame, stories: Array, order: Index, unit: float
+) -> list[Renewal]:
+    before = np.cumsum(stories, axis=1)[:, :-1]
+    total = stories.sum(axis=1)
+    static = np.maximum(total, 0.0)[:, None]
+    went, came = before - _COST - static, total[:, None] - before - _COST - static
+    found = []
+    for kind, gain in (("vanished", went), ("appeared", came)):
+        found += _runs(places, elements, gain, kind, order, unit)
+    return found
+
+
+def _moved(
+    places: Places,
+    elements: gpd.GeoDataFrame,
+    seen: pd.DataFrame,
+    observations: gpd.GeoDataFrame,
+    drive: Index,
+    order: Index,
+    unit: float,
+) -> list[Renewal]:
+    """Find stretches that lie elsewhere since one of the drives."""
+    own = seen[seen["own"] & np.isfinite(places.normal[seen["place"], 0])]
+    if own.empty:
+        return []
+    place = own["place"].to_numpy()
+    lines = as_lines(observations.geometry.to_numpy()[own["observation"]])
+    points = shapely.points(places.points[place])
+    foot = shapely.get_coordinates(shapely.line_interpolate_point(lines, shapely.line_locate_point(lines, points)))
+    away = foot - places.points[place]
+    aside = (away * places.normal[place]).sum(axis=1)
+    beside = np.hypot(*away.T) - np.abs(aside) < 0.5 * unit
+    cell = place[beside] * len(order) + drive[own["instance"].to_numpy()[beside]]
+    size = np.bincount(cell, minlength=len(places.points) * len(order)).reshape(-1, len(order))
+    sums = np.bincount(cell, aside[beside], minlength=size.size).reshape(size.shape)
+    offset = np.where(size > 0, sums / np.maximum(size, 1), np.nan)
+    offset = _without_shift(offset, places.normal)
+    noise = _noise(offset, elements["class"].to_numpy()[places.element], unit)
+    gain = np.full((len(offset), len(order) - 1), -np.inf)
+    for number in range(1, len(order)):
+        parts = (offset[:, :number], offset[:, number:])
+        counts = [np.isfinite(part).sum(axis=1) for part in parts]
+        means = [np.nansum(part, axis=1) / np.maximum(many, 1) for part, many in zip(parts, counts, strict=True)]
+        both = (counts[0] > 0) & (counts[1] > 0)
+        spread = noise * np.sqrt(sum(1 / np.maximum(many, 1) for many in counts))
+        fit = 0.5 * ((means[1] - means[0]) / spread) ** 2 + np.log(np.sqrt(2 * np.pi) * spread / (2 * REACH * unit))
+        gain[both, number - 1] = fit[both] - _COST
+    return _runs(places, elements, gain, "moved", order, unit)
+
+
+def _without_shift(offset: Array, normal: Array) -> Array:
+    """Take away what a drive is off as a whole: the shift that its lines say together, robustly."""
+    known = np.isfinite(offset).any(axis=1, keepdims=True)
+    centred = offset - np.nanmedian(np.where(known, offset, 0.0), axis=1, keepdims=True)
+    for column in range(offset.shape[1]):
+        rows = np.flatnonzero(np.isfinite(centred[:, column]))
+        if len(rows) < 3:
+            continue
+        weight = np.ones(len(rows))
+        for _ in range(5):
+            held = normal[rows] * weight[:, None]
+            matrix = held.T @ normal[rows] + 1e-3 * len(rows) * np.eye(2)
+            shift = np.linalg.solve(matrix, held.T @ centred[rows, column])
+            residual = centred[rows, column] - normal[rows] @ shift
+            scale = max(1e-6, 1.4826 * float(np.median(np.abs(residual))))
+            weight = 1 / (1 + (residual / (2.385 * scale)) ** 2)
+        offset[rows, column] -= normal[rows] @ shift
+    return offset
+
+
+def _noise(offset: Array, cls: NDArray[np.object_], unit: float) -> Array:
+    """Return how far apart drives are in what they say of a line of each class, robustly; metres."""
+    noise = np.full(len(offset), 0.3 * unit)
+    several = np.isfinite(offset).sum(axis=1) >= 2
+    for name in np.unique(cls[several].astype(str)):
+        rows = several & (cls == name)
+        residual = offset[rows] - np.nanmedian(offset[rows], axis=1, keepdims=True)
+        count = np.isfinite(residual).sum(axis=1, keepdims=True)
+        # The median is drawn towards what it is the median of.
+        residual = (residual * np.sqrt(count / np.maximum(count - 1, 1)))[np.isfinite(residual)]
+        noise[rows] = (
+            max(_LEAST * unit, 1.4826 * float(np.median(np.abs(residual[residual != 0]))))
+            if (residual != 0).any()
+            else _LEAST * unit
+        )
+    return noise
+
+
+def _runs(
+    places: Places, elements: gpd.GeoDataFrame, gain: Array, kind: str, order: Index, unit: float
+) -> list[Renewal]:
+    """Return stretches of elements along which a change is the likeliest story, each with its likeliest time."""
+    best = gain.max(axis=1, initial=-np.inf)
+    found = []
+    shapes = elements.geometry.to_numpy()
+    # Few elements have any such place.
+    for element in np.unique(places.element[best > 0]):
+        rows = np.flatnonzero(places.element == element)
+        chosen = np.flatnonzero(best[rows] > 0)
+        gaps = np.flatnonzero(np.diff(chosen) > max(1.0, _BRIDGED / _STEP)) + 1
+        for run in np.split(chosen, gaps):
+            inside = rows[run[0] : run[-1] + 1]
+            together = gain[inside].sum(axis=0)
+            whole = len(inside) >= 0.8 * len(rows)
+            if together.max() <= 0 or not (whole or len(inside) * _STEP >= _SHORTEST):
+                continue
+            zone = shapely.buffer(_along(shapes[element], places.points[inside], whole=whole, unit=unit), REACH * unit)
+            since = int(order[int(np.argmax(together)) + 1])
+            found.append(Renewal(str(elements["class"].iloc[element]), kind, zone, since))
+    return found
+
+
+def _along(shape: BaseGeometry, points: Array, *, whole: bool, unit: float) -> BaseGeometry:
+    """Return the stretch of an element along some of its places."""
+    if whole or shape.geom_type == "Polygon":
+        return shape
+    at = shapely.line_locate_point(shape, shapely.points(points))
+    start, stop = max(0.0, float(at.min()) - _STEP / 2 * unit), min(shape.length, float(at.max()) + _STEP / 2 * unit)
+    return Curves(np.array([shape], dtype=object)).stretches(np.zeros(1, np.intp), np.array([start]), np.array([stop]))[
+        0
+    ]
