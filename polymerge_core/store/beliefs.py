@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from polymerge_core.consensus.alongside import REACH
+from polymerge_core.consensus.fusion import CORRELATION
 from polymerge_core.consensus.looks import Instances
 from polymerge_core.consensus.support import SURE, chances
 from polymerge_core.curves import Array, Curves, Index, count_up
@@ -56,8 +57,14 @@ _SHORTEST = 8.0
 #: Shorter gaps in what has changed are no gaps, proximities.
 _BRIDGED = 6.0
 
+#: Whether a line lies elsewhere is judged over so many proximities.
+_WINDOW = 40.0
+
 #: Drives are taken to be at least this far apart in what they say of a line, proximities.
 _LEAST = 0.1
+
+#: Median absolute deviation to standard deviation, for normal errors.
+_MAD = 1.4826
 
 _SQUARE = 5.0
 _COST = -np.log(CHANGE)
@@ -100,6 +107,7 @@ class Judgement(NamedTuple):
 
 def judge_elements(
     elements: gpd.GeoDataFrame,
+    is_area: NDArray[np.bool_],
     lineage: pd.DataFrame,
     observations: gpd.GeoDataFrame,
     instances: gpd.GeoDataFrame,
@@ -112,6 +120,8 @@ def judge_elements(
     ----------
     elements : GeoDataFrame
         As merged: `class`.
+    is_area : ndarray of bool, shape (m,)
+        Which are areas, also where they are drawn as lines.
     lineage : DataFrame
         `element` (row), `observation` (row) of what was merged.
     observations : GeoDataFrame
@@ -124,7 +134,7 @@ def judge_elements(
     unit : float
         The proximity, metres.
     """
-    places = _places(elements, place, unit)
+    places = _places(elements, is_area, place, unit)
     drive, order = drives_in_order(instances)
     seen = _sightings(places, elements, lineage, observations, unit)
     stories = _stories(places, seen, instances, drive, len(order), unit)
@@ -151,9 +161,8 @@ def drives_in_order(instances: gpd.GeoDataFrame) -> tuple[Index, Index]:
     return number.reindex(held["drive"]).to_numpy(dtype=np.intp), first["row"].to_numpy(dtype=np.intp)
 
 
-def _places(elements: gpd.GeoDataFrame, place: BaseGeometry, unit: float) -> Places:
+def _places(elements: gpd.GeoDataFrame, area: NDArray[np.bool_], place: BaseGeometry, unit: float) -> Places:
     shapes = elements.geometry.to_numpy()
-    area = shapely.get_type_id(shapes) == shapely.GeometryType.POLYGON
     rows = np.flatnonzero(~area)
     curves = Curves(shapes[rows])
     steps = np.maximum(np.round(curves.length / (_STEP * unit)), 1).astype(np.intp)
@@ -263,24 +272,61 @@ def _moved(
     aside = (away * places.normal[place]).sum(axis=1)
     beside = np.hypot(*away.T) - np.abs(aside) < 0.5 * unit
     cell = place[beside] * len(order) + drive[own["instance"].to_numpy()[beside]]
-    size = np.bincount(cell, minlength=len(places.points) * len(order)).reshape(-1, len(order))
-    sums = np.bincount(cell, aside[beside], minlength=size.size).reshape(size.shape)
-    offset = np.where(size > 0, sums / np.maximum(size, 1), np.nan)
-    offset = _without_shift(offset, places.normal)
-    noise = _noise(offset, elements["class"].to_numpy()[places.element], unit)
-    gain = np.full((len(offset), len(order) - 1), -np.inf)
-    for number in range(1, len(order)):
-        parts = (offset[:, :number], offset[:, number:])
-        counts = [np.isfinite(part).sum(axis=1) for part in parts]
-        means = [np.nansum(part, axis=1) / np.maximum(many, 1) for part, many in zip(parts, counts, strict=True)]
-        both = (counts[0] > 0) & (counts[1] > 0)
-        spread = noise * np.sqrt(sum(1 / np.maximum(many, 1) for many in counts))
-        fit = 0.5 * ((means[1] - means[0]) / spread) ** 2 + np.log(np.sqrt(2 * np.pi) * spread / (2 * REACH * unit))
-        gain[both, number - 1] = fit[both] - _COST
-    return _runs(places, elements, gain, "moved", order, unit)
+    many = np.bincount(cell, minlength=len(places.points) * len(order)).reshape(-1, len(order))
+    sums = np.bincount(cell, aside[beside], minlength=many.size).reshape(many.shape)
+    offset = np.where(many > 0, sums / np.maximum(many, 1), np.nan)
+    within = aside[beside] - offset.ravel()[cell]
+    cls = elements["class"].to_numpy()[places.element]
+    of_drive, of_looks = _variance(offset, many, within, cell // len(order), cls, unit)
+    offset = _without_shift(offset, of_drive + of_looks, places.normal)
+
+    half = int(_WINDOW / _STEP / 2)
+    every = np.arange(len(places.points))
+    begin = np.searchsorted(places.element, places.element)
+    end = np.searchsorted(places.element, places.element, side="right") - 1
+    around = _together(offset, of_drive, of_looks, np.maximum(every - half, begin), np.minimum(every + half, end))
+    return _runs(places, elements, _steps(*around, unit), "moved", order, unit, shortest=0.0)
 
 
-def _without_shift(offset: Array, normal: Array) -> Array:
+def _together(offset: Array, of_drive: Array, of_looks: Array, first: Index, last: Index) -> tuple[Array, Array]:
+    """Return what drives say of stretches of places, first to last, in the mean, and the variance of that.
+
+    What a drive errs is the same all along; the errors of looks are alike over `CORRELATION` proximities.
+    """
+    known = np.isfinite(offset)
+    sums = []
+    for values in (known, np.where(known, offset, 0.0), np.where(known, of_looks, 0.0)):
+        total = np.concatenate([np.zeros((1, offset.shape[1])), np.cumsum(values, axis=0)])
+        sums.append(total[last + 1] - total[first])
+    count, total, looks = sums
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    apart = np.maximum(1.0, count * _STEP / CORRELATION)
+    return mean, of_drive[first] + looks / np.maximum(count, 1) / apart
+
+
+def _steps(offset: Array, variance: Array, unit: float) -> Array:
+    """Return how much likelier a step is than none, before each drive but the first: log-odds, -inf where none can be.
+
+    One drive may be wrong in itself: two must agree on either side.
+    """
+    gain = np.full((len(offset), offset.shape[1] - 1), -np.inf)
+    there = np.isfinite(offset)
+    value, spread = np.where(there, offset, 0.0), np.where(there, variance, 0.0)
+    for number in range(2, offset.shape[1] - 1):
+        sides = (slice(None, number), slice(number, None))
+        count = [there[:, side].sum(axis=1) for side in sides]
+        enough = (count[0] >= 2) & (count[1] >= 2)
+        means = [value[enough, side].sum(axis=1) / n[enough] for side, n in zip(sides, count, strict=True)]
+        error = np.sqrt(
+            sum(spread[enough, side].sum(axis=1) / n[enough] ** 2 for side, n in zip(sides, count, strict=True))
+        )
+        # Against a step of any size within reach (Occam's factor).
+        size = np.log(np.sqrt(2 * np.pi) * error / (2 * REACH * unit))
+        gain[enough, number - 1] = 0.5 * ((means[1] - means[0]) / error) ** 2 + size - _COST
+    return gain
+
+
+def _without_shift(offset: Array, variance: Array, normal: Array) -> Array:
     """Take away what a drive is off as a whole: the shift that its lines say together, robustly."""
     known = np.isfinite(offset).any(axis=1, keepdims=True)
     centred = offset - np.nanmedian(np.where(known, offset, 0.0), axis=1, keepdims=True)
@@ -288,38 +334,47 @@ def _without_shift(offset: Array, normal: Array) -> Array:
         rows = np.flatnonzero(np.isfinite(centred[:, column]))
         if len(rows) < 3:
             continue
+        deviation = np.sqrt(variance[rows, column])
+        across, said = normal[rows] / deviation[:, None], centred[rows, column] / deviation
         weight = np.ones(len(rows))
-        for _ in range(5):
-            held = normal[rows] * weight[:, None]
-            matrix = held.T @ normal[rows] + 1e-3 * len(rows) * np.eye(2)
-            shift = np.linalg.solve(matrix, held.T @ centred[rows, column])
-            residual = centred[rows, column] - normal[rows] @ shift
-            scale = max(1e-6, 1.4826 * float(np.median(np.abs(residual))))
-            weight = 1 / (1 + (residual / (2.385 * scale)) ** 2)
+        shift = np.zeros(2)
+        for _ in range(10):
+            held = across * weight[:, None]
+            shift = np.linalg.solve(held.T @ across + np.eye(2), held.T @ said)
+            # Cauchy's weights: what moved does not count.
+            weight = 1 / (1 + ((said - across @ shift) / 2.385) ** 2)
         offset[rows, column] -= normal[rows] @ shift
     return offset
 
 
-def _noise(offset: Array, cls: NDArray[np.object_], unit: float) -> Array:
-    """Return how far apart drives are in what they say of a line of each class, robustly; metres."""
-    noise = np.full(len(offset), 0.3 * unit)
-    several = np.isfinite(offset).sum(axis=1) >= 2
-    for name in np.unique(cls[several].astype(str)):
-        rows = several & (cls == name)
-        residual = offset[rows] - np.nanmedian(offset[rows], axis=1, keepdims=True)
-        count = np.isfinite(residual).sum(axis=1, keepdims=True)
-        # The median is drawn towards what it is the median of.
-        residual = (residual * np.sqrt(count / np.maximum(count - 1, 1)))[np.isfinite(residual)]
-        noise[rows] = (
-            max(_LEAST * unit, 1.4826 * float(np.median(np.abs(residual[residual != 0]))))
-            if (residual != 0).any()
-            else _LEAST * unit
-        )
-    return noise
+def _variance(
+    offset: Array, many: Index, within: Array, place: Index, cls: NDArray[np.object_], unit: float
+) -> tuple[Array, Array]:
+    """Return the variance of what each drive says of each place: its own, and that of its looks over their number."""
+    least = (_LEAST * unit) ** 2
+    of_drive, of_looks = np.full((len(offset), 1), least), np.zeros(offset.shape)
+    for name in np.unique(cls.astype(str)):
+        rows = cls == name
+        single = rows[place] & (within != 0)
+        look = (_MAD * float(np.median(np.abs(within[single])))) ** 2 if single.any() else (0.3 * unit) ** 2
+        # From one drive to the next: where the road changes but one of these is large.
+        step = np.diff(offset[rows], axis=1)
+        known = np.isfinite(step)
+        own = (_MAD * float(np.median(np.abs(step[known])))) ** 2 / 2 if known.any() else least
+        usual = float(np.mean(1.0 / many[rows][many[rows] > 0])) if (many[rows] > 0).any() else 1.0
+        of_drive[rows] = max(least, own - look * usual)
+        of_looks[rows] = look / np.maximum(many[rows], 1)
+    return of_drive, of_looks
 
 
 def _runs(
-    places: Places, elements: gpd.GeoDataFrame, gain: Array, kind: str, order: Index, unit: float
+    places: Places,
+    elements: gpd.GeoDataFrame,
+    gain: Array,
+    kind: str,
+    order: Index,
+    unit: float,
+    shortest: float = _SHORTEST,
 ) -> list[Renewal]:
     """Return stretches of elements along which a change is the likeliest story, each with its likeliest time."""
     best = gain.max(axis=1, initial=-np.inf)
@@ -328,24 +383,25 @@ def _runs(
     # Few elements have any such place.
     for element in np.unique(places.element[best > 0]):
         rows = np.flatnonzero(places.element == element)
-        chosen = np.flatnonzero(best[rows] > 0)
+        # Where one place changed, that its neighbours did too is as likely as not: only what is seen of them counts.
+        chosen = np.flatnonzero(best[rows] > -_COST)
         gaps = np.flatnonzero(np.diff(chosen) > max(1.0, _BRIDGED / _STEP)) + 1
         for run in np.split(chosen, gaps):
             inside = rows[run[0] : run[-1] + 1]
-            together = gain[inside].sum(axis=0)
+            sure = inside[best[inside] > 0]
             whole = len(inside) >= 0.8 * len(rows)
-            if together.max() <= 0 or not (whole or len(inside) * _STEP >= _SHORTEST):
+            if len(sure) == 0 or not (whole or len(sure) * _STEP >= shortest):
                 continue
             zone = shapely.buffer(_along(shapes[element], places.points[inside], whole=whole, unit=unit), REACH * unit)
-            since = int(order[int(np.argmax(together)) + 1])
+            since = int(order[int(np.argmax(gain[sure].sum(axis=0))) + 1])
             found.append(Renewal(str(elements["class"].iloc[element]), kind, zone, since))
     return found
 
 
 def _along(shape: BaseGeometry, points: Array, *, whole: bool, unit: float) -> BaseGeometry:
     """Return the stretch of an element along some of its places."""
-    if whole or shape.geom_type == "Polygon":
-        return shape
+    if whole:
+        return shapely.convex_hull(shape) if shape.is_ring else shape
     at = shapely.line_locate_point(shape, shapely.points(points))
     start, stop = max(0.0, float(at.min()) - _STEP / 2 * unit), min(shape.length, float(at.max()) + _STEP / 2 * unit)
     return Curves(np.array([shape], dtype=object)).stretches(np.zeros(1, np.intp), np.array([start]), np.array([stop]))[

@@ -159,7 +159,10 @@ class Redraw:
         observations = seen.assign(instance=context.instances.index.get_indexer(whose))
         instances = context.instances.assign(geometry=merged.pieces.footprints)
         lineage = merged.lineage[["row", "piece"]].rename(columns={"row": "element", "piece": "observation"})
-        judged = judge_elements(merged.elements, lineage, observations, instances, self.place, self.settings.proximity)
+        area = self._is_area(merged.elements)
+        judged = judge_elements(
+            merged.elements, area, lineage, observations, instances, self.place, self.settings.proximity
+        )
         merged.elements["evidence"] = judged.evidence
         if not judged.renewals:
             return False
