@@ -32,6 +32,9 @@ from benchmarks.scenarios import MIAMI, PITTSBURGH, Road, Scenario, av2_road, de
 #: The road changes after so many drives, and is looked at after so many.
 CHANGED_AFTER, LOOKED_AT, DRIVES = 2, 5, 8
 
+#: What changes is in view of so many of the 15 frames of each drive for this long, metres.
+FRAMES_IN_VIEW, LENGTH_M = 5, 15.0
+
 #: How far a boundary moves and a divider is painted aside, metres.
 BOUNDARY_M, DIVIDER_M = 1.5, 0.8
 
@@ -51,6 +54,17 @@ class Change:
     new: shapely.Geometry | None
 
 
+def in_view(drive: Scenario) -> shapely.Geometry:
+    """Return what at least `FRAMES_IN_VIEW` frames of a drive look at."""
+    footprints = drive.local[0].instances.geometry.to_numpy()
+    faces = shapely.get_parts(
+        shapely.polygonize(shapely.get_parts(shapely.node(shapely.union_all(shapely.boundary(footprints)))))
+    )
+    points = shapely.point_on_surface(faces)
+    count = np.array([int(shapely.contains(footprints, point).sum()) for point in points])
+    return shapely.union_all(faces[count >= FRAMES_IN_VIEW])
+
+
 def changed_road(road: Road, seed: int, seen: shapely.Geometry) -> tuple[Road, Road, list[Change]]:
     """Return the road before and after it changes, and what changes, all of it within view.
 
@@ -68,8 +82,8 @@ def changed_road(road: Road, seed: int, seen: shapely.Geometry) -> tuple[Road, R
     inside = shapely.length(shapely.intersection(truth.geometry.to_numpy(), seen))
     share = inside / np.maximum(shapely.length(truth.geometry.to_numpy()), 1e-9)
     cls = truth["class"].to_numpy()
-    dividers = rng.permutation(np.flatnonzero((cls == "divider") & (inside > 15)))
-    boundaries = rng.permutation(np.flatnonzero((cls == "boundary") & (inside > 15)))
+    dividers = rng.permutation(np.flatnonzero((cls == "divider") & (inside > LENGTH_M)))
+    boundaries = rng.permutation(np.flatnonzero((cls == "boundary") & (inside > LENGTH_M)))
     crossings = rng.permutation(np.flatnonzero((cls == "ped_crossing") & (share > 0.99)))
     vanish, appear, paint = dividers[:2], dividers[2:3], dividers[3:4]
     move, new = boundaries[:1], crossings[:1]
@@ -115,7 +129,7 @@ def renewals(path: Path) -> gpd.GeoDataFrame:
 
 def follow(road: Road, seed: int, noise: Noise | None, folder: Path) -> dict[str, Any]:
     """Feed a map drives on a road that changes; count what it found."""
-    seen = shapely.union_all(road.drive("look", seed=seed, noise=noise).local[0].instances.geometry.to_numpy())
+    seen = in_view(road.drive("look", seed=seed, noise=noise))
     before, after, changes = changed_road(road, seed, seen)
     store = pm.MapStore(folder / f"{seed}.gpkg", create=True)
     for drive in drives(before, after, seed, noise, LOOKED_AT):
