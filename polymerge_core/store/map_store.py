@@ -27,7 +27,7 @@ from polymerge_core.sets import Input, as_local_maps
 from polymerge_core.store import geopackage
 from polymerge_core.store.evidence import Evidence, add, read_evidence, without_known
 from polymerge_core.store.geopackage import PATIENCE_S, connect, stamp, transaction
-from polymerge_core.store.redraw import Counts, Redraw, as_elements, read_elements
+from polymerge_core.store.redraw import Counts, Redraw, as_elements, displacement, read_elements
 from polymerge_core.store.tables import ELEMENT, Settings, create_map, read_settings, software
 from polymerge_core.store.verify import faults
 
@@ -283,8 +283,10 @@ class MapStore:
                 self._check_revision(connection, since)
             names = ", ".join(f'"{name}"' for name in ELEMENT)
             rows = connection.execute(
-                f"SELECT element_id, geom, {names}, kind, revision FROM changes WHERE fid IN "
-                "(SELECT MAX(fid) FROM changes WHERE revision > ? GROUP BY element_id) ORDER BY element_id",
+                f"SELECT c.element_id, geom, {names}, CASE WHEN l.moved AND c.kind = 'changed' THEN 'moved' "
+                "ELSE c.kind END, c.revision FROM changes c JOIN "
+                "(SELECT MAX(fid) AS last, MAX(kind = 'moved') AS moved FROM changes "
+                "WHERE revision > ? GROUP BY element_id) l ON c.fid = l.last ORDER BY c.element_id",
                 (since,),
             ).fetchall()
         now = as_elements([row[:-2] for row in rows], settings)
@@ -455,14 +457,6 @@ def _count(connection: sqlite3.Connection, table: str) -> int:
     return int(
         connection.execute("SELECT feature_count FROM gpkg_ogr_contents WHERE table_name = ?", (table,)).fetchone()[0]
     )
-
-
-def displacement(old: BaseGeometry, new: BaseGeometry) -> float:
-    """Return the median distance from points along the one line to the other, metres."""
-    points = shapely.line_interpolate_point(
-        new if new.geom_type != "Polygon" else new.exterior, np.linspace(0, 1, 21), normalized=True
-    )
-    return float(np.median(shapely.distance(old if old.geom_type != "Polygon" else old.exterior, points)))
 
 
 def now() -> str:

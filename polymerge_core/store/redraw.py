@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import geopandas as gpd
@@ -19,19 +19,26 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
+from polymerge_core.consensus.alongside import REACH
 from polymerge_core.consensus.run import UNSUPPORTED
 from polymerge_core.curves import Array, Index
 from polymerge_core.merge import merge
 from polymerge_core.observations import as_lines
 from polymerge_core.schema import NO_ELEMENT
 from polymerge_core.store import geopackage
-from polymerge_core.store.beliefs import SURE_OF, judge_elements
+from polymerge_core.store.beliefs import SURE_OF, Renewal, drives_in_order, judge_elements
 from polymerge_core.store.evidence import Context, Pieces, read_context, still_valid
 from polymerge_core.store.stitching import Chain, Piece, cut_at, put_together, shares
 from polymerge_core.store.tables import ELEMENT, Settings
 
 #: Why a piece of an observation is in no element.
 RENEWED = "the road changed since"
+
+#: From so many drives on the last two may be too few to be heard at once.
+_MANY = 4
+
+#: What lies less far from where it was has not moved, proximities.
+_AS_IT_WAS = 0.25
 
 #: The place is looked over so often for changes: what one hides may show then.
 _RENEWALS = 2
@@ -94,6 +101,8 @@ class Redraw:
     place: BaseGeometry
     revision: int
     counts: Counts = field(default_factory=Counts)
+    #: Where the road is found to have changed.
+    renewals: list[Renewal] = field(default_factory=list)
 
     def run(self) -> Counts:
         """Draw the place anew, and write what changed."""
@@ -159,11 +168,22 @@ class Redraw:
         observations = seen.assign(instance=context.instances.index.get_indexer(whose))
         instances = context.instances.assign(geometry=merged.pieces.footprints)
         lineage = merged.lineage[["row", "piece"]].rename(columns={"row": "element", "piece": "observation"})
-        area = self._is_area(merged.elements)
+        elements = merged.elements[["class", "geometry"]]
+        if not self.renewals:
+            newest, theirs = self._newest(context, merged)
+            lineage = pd.concat([lineage, theirs.assign(element=theirs["element"] + len(elements))], ignore_index=True)
+            elements = pd.concat([elements, newest], ignore_index=True)
         judged = judge_elements(
-            merged.elements, area, lineage, observations, instances, self.place, self.settings.proximity
+            elements,
+            self._is_area(elements),
+            lineage,
+            observations,
+            instances,
+            self.place,
+            self.settings.proximity,
         )
-        merged.elements["evidence"] = judged.evidence
+        merged.elements["evidence"] = judged.evidence[: len(merged.elements)]
+        self.renewals += judged.renewals
         if not judged.renewals:
             return False
         first = context.instances.iloc[[renewal.since for renewal in judged.renewals]]
@@ -182,6 +202,45 @@ class Redraw:
         )
         geopackage.touched(self.connection, "renewed", shapes)
         return True
+
+    def _newest(self, context: Context, merged: Merged) -> tuple[gpd.GeoDataFrame, pd.DataFrame]:
+        """Return what the last two drives see and nobody saw before them, who are too many to be outvoted by two.
+
+        Returns
+        -------
+        elements : GeoDataFrame
+            `class`, and the shape.
+        lineage : DataFrame
+            `element` (row), `observation` (row of the pieces).
+        """
+        drive, first = drives_in_order(context.instances)
+        maps = merged.pieces.local_maps
+        nothing = (
+            merged.elements[["class", "geometry"]].iloc[:0],
+            pd.DataFrame({"element": [], "observation": []}, dtype=int),
+        )
+        if len(first) < _MANY or maps.instances is None:
+            return nothing
+        late = context.instances.index[drive >= len(first) - 2]
+        whose = context.observations["instance_fid"].reindex(merged.pieces.observation)
+        rows = np.flatnonzero(whose.isin(late))
+        theirs = replace(
+            maps,
+            observations=maps.observations.iloc[rows].reset_index(drop=True),
+            instances=maps.instances[maps.instances.index.isin(late)],
+        )
+        result = merge(theirs, proximity=self.settings.proximity, area=self.settings.area)
+        new = np.ones(len(result.elements), dtype=bool)
+        for cls, own in result.elements.groupby("class"):
+            known = merged.elements.geometry[merged.elements["class"] == cls].to_numpy()
+            middle = shapely.line_interpolate_point(as_lines(own.geometry.to_numpy()), 0.5, normalized=True)
+            if len(known):
+                far = shapely.distance(shapely.union_all(as_lines(known)), middle)
+                new[own.index] = far > REACH * self.settings.proximity
+        number = np.cumsum(new) - 1
+        row = np.searchsorted(result.elements["element_id"], result.lineage["element_id"])
+        lineage = pd.DataFrame({"element": number[row], "observation": rows[result.lineage["source_fid"]]})[new[row]]
+        return result.elements.loc[new, ["class", "geometry"]], lineage
 
     def _lineage(self, context: Context) -> pd.DataFrame:
         """Return which intervals of the observations of the context are in which element."""
@@ -231,6 +290,7 @@ class Redraw:
         kept = kept.sort_values(["length", "shape"], ascending=[False, True], kind="stable").drop_duplicates(
             "element_id"
         )
+        kept = pd.concat([kept, _beside(shapes, kept, stored, REACH * self.settings.proximity)], ignore_index=True)
         ids = np.full(len(shapes), NO_ELEMENT, dtype=np.int64)
         smallest = kept.groupby("shape")["element_id"].min()
         ids[smallest.index.to_numpy(dtype=np.intp)] = smallest.to_numpy()
@@ -365,11 +425,16 @@ class Redraw:
             attributes = {name: held[name] for name in ELEMENT}
             write(self.connection, "elements", {"element_id": held.index, "geom": blobs, **attributes})
         written = now[changed]
-        self._note(written, np.where(new[changed], "added", "changed"))
+        kind = np.where(new[changed], "added", "changed").astype(object)
+        by = np.zeros(len(written))
+        for row in np.flatnonzero(~new[changed]):
+            by[row] = self._moved(written.iloc[row], was.geometry.loc[written.index[row]])
+        kind[by > 0] = "moved"
+        self._note(written, kind, by)
         lost = was.loc[sorted(gone)]
         self.connection.executemany("DELETE FROM elements WHERE element_id = ?", [(int(old),) for old in lost.index])
         ends = np.array([gone[int(old)] for old in lost.index], dtype=np.int64)
-        self._note(lost, np.where(ends == NO_ELEMENT, "retired", "merged"))
+        self._note(lost, np.where(ends == NO_ELEMENT, "retired", "merged"), np.zeros(len(lost)))
         geopackage.insert(
             self.connection,
             "id_aliases",
@@ -382,10 +447,20 @@ class Redraw:
         for table in ("elements", "changes"):
             geopackage.touched(self.connection, table, written.geometry.to_numpy())
         counts = self.counts
-        counts.added, counts.changed = int(new.sum()), int((changed & ~new).sum())
+        counts.added, counts.moved = int(new.sum()), int((kind == "moved").sum())
+        counts.changed = int((changed & ~new).sum()) - counts.moved
         counts.retired, counts.merged = int((ends == NO_ELEMENT).sum()), int((ends != NO_ELEMENT).sum())
 
-    def _note(self, elements: gpd.GeoDataFrame, kind: Iterable[str]) -> None:
+    def _moved(self, element: pd.Series[Any], was: BaseGeometry) -> float:
+        """Return how far an element moved where the road is found to have changed, metres; 0 where it did not."""
+        zones = [renewal.zone for renewal in self.renewals if renewal.cls == element["class"]]
+        if not zones:
+            return 0.0
+        there = shapely.intersection(element.geometry, shapely.union_all(zones))
+        by = 0.0 if there.is_empty else displacement(was, there)
+        return by if by > _AS_IT_WAS * self.settings.proximity else 0.0
+
+    def _note(self, elements: gpd.GeoDataFrame, kind: Iterable[str], moved_m: Array) -> None:
         """Put down what changed; nothing of it is ever changed again."""
         geopackage.insert(
             self.connection,
@@ -395,6 +470,7 @@ class Redraw:
                 "revision": [self.revision] * len(elements),
                 "element_id": elements.index,
                 "kind": list(kind),
+                "moved_m": moved_m,
                 **{name: elements[name] for name in ELEMENT},
             },
         )
@@ -431,6 +507,34 @@ def as_time(nanoseconds: pd.Series[float]) -> list[str | None]:
         else str(np.datetime64(int(value), "ns").astype("datetime64[ms]")) + "Z"
         for value in nanoseconds.astype(object)
     ]
+
+
+def displacement(old: BaseGeometry, new: BaseGeometry) -> float:
+    """Return the median distance from points along what is new to what was, metres."""
+    old, new = (shape.boundary if shape.geom_type.endswith("Polygon") else shape for shape in (old, new))
+    parts = shapely.get_parts(shapely.segmentize(new, max(new.length / 20, 1e-3)))
+    return float(np.median(shapely.distance(old, shapely.points(shapely.get_coordinates(parts)))))
+
+
+def _beside(shapes: list[Shape], kept: pd.DataFrame, stored: gpd.GeoDataFrame, reach: float) -> pd.DataFrame:
+    """Return stored elements that nothing was drawn of, and the new shape of their class that lies beside each.
+
+    A line that was painted elsewhere is the same line elsewhere.
+    """
+    taken = set(kept["shape"])
+    found = []
+    for own in stored.index.difference(kept["element_id"]):
+        element = stored.loc[own]
+        apart = {
+            row: displacement(element.geometry, shape.line)
+            for row, shape in enumerate(shapes)
+            if row not in taken and shape.cls == element["class"]
+        }
+        nearest = min(apart, key=lambda row: (round(apart[row], 6), row), default=None)
+        if nearest is not None and apart[nearest] <= reach:
+            taken.add(nearest)
+            found.append((int(own), nearest, 0.0))
+    return pd.DataFrame(found, columns=["element_id", "shape", "length"]).astype({"element_id": int, "shape": int})
 
 
 def _renumbered(pieces: list[Piece], rows: Index) -> list[Piece]:
