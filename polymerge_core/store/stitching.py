@@ -91,9 +91,14 @@ def _cut(line: BaseGeometry, place: BaseGeometry, *, inside: bool) -> list[tuple
     here = shapely.intersects(place, shapely.points(middle)) == inside
     runs = _runs(here)
     bounds = [(places[first], places[last + 1]) for first, last in runs]
-    ends = [(first > 0, last < len(here) - 1) for first, last in runs]
+    closed = bool(curves.closed[0])
+    if closed:
+        edge = np.full(2, here[0] != here[-1])
+    else:
+        edge = shapely.distance(shapely.boundary(place), shapely.get_point(line, [0, -1])) < _NOTHING
+    ends = [(bool(first > 0 or edge[0]), bool(last < len(here) - 1 or edge[1])) for first, last in runs]
     # A ring goes on where it ends.
-    around = bool(curves.closed[0]) and len(runs) > 1 and here[0] and here[-1]
+    around = closed and len(runs) > 1 and here[0] and here[-1]
     if around:
         bounds[0] = (bounds[-1][0], length + bounds[0][1])
         bounds, ends = bounds[:-1], [(True, True), *ends[1:-1]]
