@@ -201,8 +201,11 @@ def _walk(
         if beyond is None:
             break
         row, side = beyond
+    if len(members) == 1:
+        # An area stays one, and a line as it is.
+        return Chain(members[0].line, tuple(members))
     joined = np.vstack(points)
-    if (row, side) == first and len(members) > 1:
+    if (row, side) == first:
         joined[-1] = joined[0]
     return Chain(shapely.linestrings(joined), tuple(members))
 
