@@ -246,6 +246,8 @@ def _choose_crs(
     layer_crs = [reference if crs is None else crs for crs in found]
     plain = [layers[number].where for number in bounds if is_local(layer_crs[number])]
     placed = [layers[number].where for number in bounds if not is_local(layer_crs[number])]
+    # That of the reference counts though it may hold nothing.
+    placed += [layer.where for layer, crs in zip(layers, found, strict=True) if crs == reference and not is_local(crs)]
     if plain and placed:
         raise CrsError(
             f"{plain[0]} has plain metric coordinates (crs=local) and cannot be brought together with {placed[0]}, "

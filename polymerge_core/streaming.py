@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from polymerge_core.console import say
-from polymerge_core.errors import InputError, PolymergeError
+from polymerge_core.errors import CrsError, InputError, PolymergeError, SchemaError
 from polymerge_core.messages import read_message
 from polymerge_core.store.map_store import MapStore, Update
 
@@ -55,17 +55,18 @@ def run_stream(
     """
     reply = answer or _print
     total: dict[str, Any] = {}
-    faults = waiting = 0
-    for number, line in enumerate(_ahead(sys.stdin if lines is None else lines), 1):
+    faults = waiting = number = 0
+    for line in _ahead(sys.stdin if lines is None else lines):
         if line is None:
             waiting = _draw(store, total) if waiting else 0
             continue
+        number += 1
         if not line.strip():
             continue
         try:
             message = read_message(line, store.crs, f"line {number}")
             done = store.update(message.local_maps, draw=False)
-        except InputError as error:
+        except (InputError, SchemaError, CrsError) as error:
             faults += 1
             say(f"error: {error}")
             reply(json.dumps({"line": number, "error": str(error)}))

@@ -114,7 +114,8 @@ def read_evidence(
     told = every.join(told)
     earliest = pd.Series(NO_TIMESTAMP, index=every.index)
     if len(table):
-        earliest.update(table["timestamp_ns"].groupby(at).min())
+        first = table["timestamp_ns"].groupby(at).min()
+        earliest[first.index] = first.to_numpy()
     told["timestamp_ns"] = [
         int(own) if own == own and own is not None else None if first == NO_TIMESTAMP else int(first)  # noqa: PLR0124
         for own, first in zip(told["timestamp_ns"], earliest, strict=True)

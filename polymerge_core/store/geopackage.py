@@ -224,7 +224,7 @@ def touched(connection: sqlite3.Connection, table: str, shapes: NDArray[np.objec
     connection.execute(
         "UPDATE gpkg_contents SET last_change = strftime('%Y-%m-%dT%H:%M:%fZ', 'now') WHERE table_name = ?", (table,)
     )
-    if shapes is None or len(shapes) == 0:
+    if shapes is None or shapely.is_empty(shapes).all():
         return
     bounds = [float(value) for value in shapely.total_bounds(shapes)]
     for column, value, larger in zip(("min_x", "min_y", "max_x", "max_y"), bounds, (0, 0, 1, 1), strict=True):
@@ -306,7 +306,9 @@ def _srs_id(crs: pyproj.CRS) -> int:
 
 def _srs_row(crs: pyproj.CRS, number: int) -> tuple[Any, ...]:
     organization = "NONE" if number == _CUSTOM_SRS else "EPSG"
-    return (crs.name, number, organization, number, crs.to_wkt("WKT1_GDAL"), None)
+    # This WKT knows no third axis but that of a vertical CRS.
+    flat = crs.to_2d() if len(crs.axis_info) > 2 and not crs.is_compound else crs
+    return (crs.name, number, organization, number, flat.to_wkt("WKT1_GDAL"), None)
 
 
 def boxes(connection: sqlite3.Connection, layer: str) -> Array:

@@ -84,7 +84,8 @@ class Update:
             left_out = {str(reason): int(count) for reason, count in reasons.items()}
             warnings = list(evidence.warnings)
         if skipped:
-            warnings.append(f"{skipped} local maps were skipped: the map knows their drive and instance already")
+            what = "1 local map was" if skipped == 1 else f"{skipped} local maps were"
+            warnings.append(f"{what} skipped: the map knows drive and instance already")
         done = vars(counts) | {"elements": elements, "left_out": left_out, "warnings": warnings}
         return cls(revision, instances, observations, skipped, **done)
 
@@ -134,7 +135,9 @@ class MapStore:
         self._proximity, self._area = proximity, area
         if self._crs is not None and not is_local(self._crs) and not is_metric(self._crs):
             raise CrsError(f"a map is kept in metres, and {self._crs.name} is not; choose a projected CRS in metres")
-        Options.of(area=area, **({} if proximity is None else {"proximity": proximity}))
+        chosen = Options.of(area=area, **({} if proximity is None else {"proximity": proximity}))
+        if self.path.is_dir():
+            raise InputError(f"{self.path} is a folder; name the file of the map")
         if not self._there():
             if not create:
                 raise InputError(f"{self.path} does not exist; a new map is made with create (--create)")
@@ -145,6 +148,11 @@ class MapStore:
             if proximity is not None and proximity != settings.proximity:
                 raise OptionError(
                     f"{self.path} was made with a proximity of {settings.proximity:g} m; leave proximity away, or make "
+                    "another map"
+                )
+            if area and chosen.area != set(settings.area):
+                raise OptionError(
+                    f"{self.path} was made with the area classes {', '.join(settings.area)}; leave area away, or make "
                     "another map"
                 )
 
@@ -217,9 +225,12 @@ class MapStore:
 
         Raises
         ------
+        InputError
+            If there is no map yet.
         OutputError
             If the map cannot be written; it is as it was then.
         """
+        self._check_there()
         with self._writing() as connection:
             settings = read_settings(connection, self.path)
             if connection.execute("SELECT 1 FROM instances WHERE drawn IS NULL").fetchone() is None:
@@ -390,8 +401,13 @@ class MapStore:
     def _there(self) -> bool:
         return self.path.exists() and self.path.stat().st_size > 0
 
+    def _check_there(self) -> None:
+        if not self._there():
+            raise InputError(f"{self.path} does not exist yet; the first update makes it")
+
     @contextlib.contextmanager
     def _opened(self, mode: str) -> Iterator[tuple[sqlite3.Connection, Settings]]:
+        self._check_there()
         with _told(self.path), contextlib.closing(connect(self.path, mode)) as connection:
             yield connection, read_settings(connection, self.path)
 

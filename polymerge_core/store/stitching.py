@@ -111,13 +111,20 @@ def _cut(line: BaseGeometry, place: BaseGeometry, *, inside: bool) -> list[tuple
     curves = Curves(np.array([line], dtype=object))
     start, stop = (np.array([getattr(each, name) for each in found]) for name in ("start", "stop"))
     lines = list(curves.stretches(np.zeros(len(found), np.intp), start, stop))
-    ends = [each.cut for each in found]
-    # A ring goes on where it ends.
-    if curves.closed[0] and len(found) > 1 and not ends[0][0] and not ends[-1][1]:
+    ends = [list(each.cut) for each in found]
+    whole = start[0] == 0.0, stop[-1] == curves.length[0]
+    if not curves.closed[0]:
+        edge = shapely.distance(shapely.boundary(place), shapely.get_point(line, [0, -1])) < _NOTHING
+    elif all(whole) and len(found) > 1:
+        # A ring goes on where it ends.
         joined = np.vstack([shapely.get_coordinates(lines[-1]), shapely.get_coordinates(lines[0])[1:]])
-        lines = [shapely.linestrings(joined), *lines[1:-1]]
-        ends = [(True, True), *ends[1:-1]]
-    return list(zip(lines, ends, strict=True))
+        lines, ends = [shapely.linestrings(joined), *lines[1:-1]], [[True, True], *ends[1:-1]]
+        edge = np.zeros(2, dtype=bool)
+    else:
+        edge = np.full(2, not all(whole))
+    ends[0][0] |= bool(whole[0] and edge[0])
+    ends[-1][1] |= bool(whole[1] and edge[1])
+    return [(piece, (cut[0], cut[1])) for piece, cut in zip(lines, ends, strict=True)]
 
 
 def _runs(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -202,8 +209,11 @@ def _walk(
         if beyond is None:
             break
         row, side = beyond
+    if len(members) == 1:
+        # An area stays one, and a line as it is.
+        return Chain(members[0].line, tuple(members))
     joined = np.vstack(points)
-    if (row, side) == first and len(members) > 1:
+    if (row, side) == first:
         joined[-1] = joined[0]
     return Chain(shapely.linestrings(joined), tuple(members))
 

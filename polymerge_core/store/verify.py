@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 
 from polymerge_core.store import geopackage
+from polymerge_core.store.tables import ELEMENT
 
 #: Lengths that are equal but for rounding are not further apart, metres.
 _EXACT = 1e-6
@@ -50,8 +51,8 @@ _QUESTIONS = {
     ),
     "elements are not as their last change says": (
         "SELECT e.element_id FROM elements e LEFT JOIN (SELECT element_id, MAX(fid) AS last FROM changes GROUP BY "
-        "element_id) l ON l.element_id = e.element_id LEFT JOIN changes c ON c.fid = l.last WHERE c.geom IS NOT e.geom "
-        "OR c.kind IN ('retired', 'merged') OR c.n_observations IS NOT e.n_observations OR c.score IS NOT e.score"
+        "element_id) l ON l.element_id = e.element_id LEFT JOIN changes c ON c.fid = l.last WHERE "
+        f"c.kind IN ('retired', 'merged') OR {' OR '.join(f'c.{name} IS NOT e.{name}' for name in ('geom', *ELEMENT))}"
     ),
     "elements that are no more have not been retired": (
         "SELECT c.element_id FROM changes c JOIN "
@@ -73,6 +74,11 @@ def faults(connection: sqlite3.Connection) -> list[str]:
     found = [f"SQLite says: {row[0]}" for row in connection.execute("PRAGMA integrity_check") if row[0] != "ok"]
     if found:
         return found
+    held = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+    wanted = ("gpkg_contents", "gpkg_ogr_contents", *_TABLES, *(f"rtree_{layer}_geom" for layer in _LAYERS))
+    found = [f"there is no table {table}" for table in wanted if table not in held]
+    if found:
+        return found
     for what, query in _QUESTIONS.items():
         rows = [row[0] for row in connection.execute(query)]
         if rows:
@@ -80,11 +86,12 @@ def faults(connection: sqlite3.Connection) -> list[str]:
     found += _intervals(connection)
     for table in _TABLES:
         (count,) = connection.execute(f'SELECT COUNT(*) FROM "{table}"').fetchone()
-        (noted,) = connection.execute(
+        noted = connection.execute(
             "SELECT feature_count FROM gpkg_ogr_contents WHERE table_name = ?", (table,)
-        ).fetchone()
-        if count != noted:
-            found.append(f"gpkg_ogr_contents counts {noted} rows of {table}, and there are {count}")
+        ).fetchall()
+        if noted != [(count,)]:
+            told = noted[0][0] if noted else "no"
+            found.append(f"gpkg_ogr_contents counts {told} rows of {table}, and there are {count}")
     for layer in _LAYERS:
         found += _layer(connection, layer)
     return found
@@ -131,8 +138,8 @@ def _layer(connection: sqlite3.Connection, layer: str) -> list[str]:
         bounds = connection.execute(
             "SELECT min_x, max_x, min_y, max_y FROM gpkg_contents WHERE table_name = ?", (layer,)
         ).fetchone()
-        if None in bounds or not (
-            (box[:, [0, 2]] >= np.array(bounds)[[0, 2]]).all() and (box[:, [1, 3]] <= np.array(bounds)[[1, 3]]).all()
-        ):
+        # GDAL writes 15 digits of them.
+        noted = np.array(bounds or [np.nan] * 4, dtype=np.float64) + 1e-9 * np.abs(box).max(axis=0) * [-1, 1, -1, 1]
+        if not ((box[:, [0, 2]] >= noted[[0, 2]]).all() and (box[:, [1, 3]] <= noted[[1, 3]]).all()):
             found.append(f"gpkg_contents has smaller bounds of {layer} than the layer")
     return found
