@@ -20,6 +20,7 @@ from polymerge_core.evaluation import REGION_FROM
 from polymerge_core.formats import read_matrix
 from polymerge_core.job import Job, split_off
 from polymerge_core.options import AGGREGATES, INSTANCE_FROM, METHODS, Options
+from polymerge_core.store.map_file import PATIENCE_S
 from polymerge_core.streaming import run_stream
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
@@ -278,6 +279,13 @@ def evaluate(
 @_source_options
 @click.option("--proximity", type=float, help="Of a map that is made: how near is near, in metres.  [default: 1]")
 @click.option("--area", multiple=True, metavar="CLASS", help="Of a map that is made: a class of areas; repeatable.")
+@click.option(
+    "--patience",
+    type=click.FloatRange(0),
+    default=PATIENCE_S,
+    show_default=True,
+    help="Seconds to wait for another program that has MAP locked.",
+)
 @click.option("--crs", callback=_known_crs, help="CRS of a map that is made, and of layers without one.")
 @click.option("--strict", is_flag=True, help="A feature that cannot be used is an error.")
 @_run_options
@@ -291,6 +299,7 @@ def update(
     crs: str | None,
     proximity: float | None,
     area: tuple[str, ...],
+    patience: float,
     **chosen: Any,
 ) -> None:
     """Feed the stored map MAP local maps (FILE, or FILE|layername=LAYER), all of them or none."""
@@ -301,7 +310,7 @@ def update(
         raise click.UsageError("--watch-stdin does not go with --stream, which reads standard input")
     made = crs if create and not stored.exists() else None
     with Job(None, local_maps, [], **run) as job:
-        held = pm.MapStore(stored, create=create, crs=made, proximity=proximity, area=area)
+        held = pm.MapStore(stored, create=create, crs=made, proximity=proximity, area=area, patience_s=patience)
         if stream:
             report = run_stream(held, draw_every=draw_every)
         else:

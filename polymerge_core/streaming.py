@@ -53,7 +53,7 @@ def run_stream(
     InputError
         At the end, if any line could not be used.
     """
-    reply = answer or _print
+    reply, crs = answer or _print, store.crs
     total: dict[str, Any] = {}
     faults = waiting = number = 0
     for line in _ahead(sys.stdin if lines is None else lines):
@@ -64,7 +64,7 @@ def run_stream(
         if not line.strip():
             continue
         try:
-            message = read_message(line, store.crs, f"line {number}")
+            message = read_message(line, crs, f"line {number}")
             done = store.update(message.local_maps, draw=False)
         except (InputError, SchemaError, CrsError) as error:
             faults += 1

@@ -14,7 +14,8 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,6 @@ from polymerge_core.curves import Array, Index
 
 #: "GPKG" as a number, and version 1.3: what the header of the file says.
 APPLICATION_ID, USER_VERSION = 0x47504B47, 10300
-
-#: Seconds to wait for somebody else who has the file locked.
-PATIENCE_S = 10.0
 
 #: The number of a CRS that no authority has one for, and that of plain metric coordinates.
 _CUSTOM_SRS, _LOCAL_SRS = 100_000, -1
@@ -84,49 +82,77 @@ _RTREE_TRIGGERS = {
 }
 
 
-def connect(path: Path, mode: str) -> sqlite3.Connection:
+class Connection(sqlite3.Connection):
+    """A connection that remembers what went wrong in a function that SQLite called, as SQLite does not."""
+
+    raised: BaseException | None = None
+
+    def serve(self, name: str, function: Callable[[bytes | None], float | None]) -> None:
+        """Let SQL call a function of one geometry."""
+
+        def call(blob: bytes | None) -> float | None:
+            try:
+                return function(blob)
+            except BaseException as error:
+                self.raised = error
+                raise
+
+        self.create_function(name, 1, call, deterministic=True)
+
+
+def connect(path: Path, patience_s: float) -> Connection:
     """Open a GeoPackage.
 
     Parameters
     ----------
     path : Path
-        The file.
-    mode : {"ro", "rw", "rwc"}
-        Reading alone, writing too, or making the file as well.
+        The file, which may be an empty one.
+    patience_s : float
+        Seconds to wait for somebody else who has it locked.
 
     Returns
     -------
-    sqlite3.Connection
+    Connection
         Transactions are begun by hand. A commit is on the disk when it returns. The functions that the triggers of a
-        GeoPackage call are there.
+        GeoPackage call are there. Whoever only reads may write, too, where the file allows it: what a killed writer
+        left must be rolled back before anything can be read.
     """
-    connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, timeout=PATIENCE_S
-    )
+    uri = f"{path.absolute().as_uri()}?mode=rw"
+    connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=patience_s, factory=Connection)
     connection.execute("PRAGMA synchronous = FULL")
     connection.execute("PRAGMA foreign_keys = OFF")
     for number, name in enumerate(("ST_MinX", "ST_MaxX", "ST_MinY", "ST_MaxY")):
-        connection.create_function(name, 1, lambda blob, at=number: _bound(blob, at), deterministic=True)
-    connection.create_function("ST_IsEmpty", 1, _is_empty, deterministic=True)
+        connection.serve(name, partial(_bound, at=number))
+    connection.serve("ST_IsEmpty", _is_empty)
     return connection
 
 
 @contextlib.contextmanager
-def transaction(connection: sqlite3.Connection) -> Iterator[None]:
+def transaction(connection: Connection) -> Iterator[None]:
     """Do everything or nothing; nobody else writes meanwhile."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         yield
-    except BaseException:
+        connection.execute("COMMIT")
+    except BaseException as error:
         # A full disk may have rolled back already.
         if connection.in_transaction:
             connection.execute("ROLLBACK")
+        if connection.raised is not None:
+            raise connection.raised from error
         raise
-    connection.execute("COMMIT")
+
+
+def is_empty(connection: sqlite3.Connection) -> bool:
+    """Tell whether a file holds nothing yet."""
+    return connection.execute("SELECT 1 FROM sqlite_master").fetchone() is None
 
 
 def create(connection: sqlite3.Connection, crs: pyproj.CRS) -> int:
     """Make an empty file a GeoPackage, within a transaction; return the number of its CRS."""
+    # These too are undone with the transaction.
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute(f"PRAGMA user_version = {USER_VERSION}")
     for statement in _CORE.split(";"):
         connection.execute(statement)
     wgs84 = pyproj.CRS.from_epsg(4326)
@@ -140,12 +166,6 @@ def create(connection: sqlite3.Connection, crs: pyproj.CRS) -> int:
         rows.append(_srs_row(crs, number))
     connection.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", rows)
     return number
-
-
-def stamp(connection: sqlite3.Connection) -> None:
-    """Say in the header of the file that it is a GeoPackage."""
-    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-    connection.execute(f"PRAGMA user_version = {USER_VERSION}")
 
 
 def create_layer(

@@ -20,13 +20,14 @@ from shapely.geometry.base import BaseGeometry
 
 from polymerge_core.consensus.alongside import REACH
 from polymerge_core.crs import is_local, is_metric, parse_crs
-from polymerge_core.errors import CrsError, InputError, OptionError, OutputError
+from polymerge_core.errors import CrsError, InputError, OptionError
 from polymerge_core.observations import as_lines
 from polymerge_core.options import Options
 from polymerge_core.sets import Input, as_local_maps
 from polymerge_core.store import geopackage
 from polymerge_core.store.evidence import Evidence, add, read_evidence, without_known
-from polymerge_core.store.geopackage import PATIENCE_S, connect, stamp, transaction
+from polymerge_core.store.geopackage import Connection, is_empty
+from polymerge_core.store.map_file import PATIENCE_S, MapFile
 from polymerge_core.store.redraw import Counts, Redraw, as_elements, displacement, read_elements
 from polymerge_core.store.tables import ELEMENT, Settings, create_map, read_settings, software
 from polymerge_core.store.verify import faults
@@ -112,6 +113,8 @@ class MapStore:
         Of a map that is made, as in `polymerge_core.merge`; 1 m by default.
     area : str or sequence of str, optional
         Of a map that is made, as in `polymerge_core.merge`.
+    patience_s : float, default 10
+        Seconds to wait for another program that has the file locked.
 
     Raises
     ------
@@ -129,32 +132,35 @@ class MapStore:
         crs: Any = None,
         proximity: float | None = None,
         area: str | Sequence[str] = (),
+        patience_s: float = PATIENCE_S,
     ) -> None:
         self.path = Path(path)
         self._crs = None if crs is None else parse_crs(crs)
         self._proximity, self._area = proximity, area
+        self._file = MapFile(self.path, create=create, patience_s=patience_s)
         if self._crs is not None and not is_local(self._crs) and not is_metric(self._crs):
             raise CrsError(f"a map is kept in metres, and {self._crs.name} is not; choose a projected CRS in metres")
-        chosen = Options.of(area=area, **({} if proximity is None else {"proximity": proximity}))
+        Options.of(area=area, **({} if proximity is None else {"proximity": proximity}))
         if self.path.is_dir():
             raise InputError(f"{self.path} is a folder; name the file of the map")
-        if not self._there():
-            if not create:
-                raise InputError(f"{self.path} does not exist; a new map is made with create (--create)")
-            return
-        with self._opened("ro") as (_, settings):
-            if crs is not None and self._crs != settings.crs:
-                raise OptionError(f"{self.path} is in {settings.crs.name}; leave crs away, or make another map")
-            if proximity is not None and proximity != settings.proximity:
-                raise OptionError(
-                    f"{self.path} was made with a proximity of {settings.proximity:g} m; leave proximity away, or make "
-                    "another map"
-                )
-            if area and chosen.area != set(settings.area):
-                raise OptionError(
-                    f"{self.path} was made with the area classes {', '.join(settings.area)}; leave area away, or make "
-                    "another map"
-                )
+        if self._file.is_there():
+            with self._opened() as (_, settings):
+                self._agree(settings)
+
+    def _agree(self, settings: Settings) -> None:
+        """Raise an error where the map was made with other options."""
+        if self._crs is not None and self._crs != settings.crs:
+            raise OptionError(f"{self.path} is in {settings.crs.name}; leave crs away, or make another map")
+        if self._proximity is not None and self._proximity != settings.proximity:
+            raise OptionError(
+                f"{self.path} was made with a proximity of {settings.proximity:g} m; leave proximity away, or make "
+                "another map"
+            )
+        if self._area and Options.of(area=self._area).area != set(settings.area):
+            raise OptionError(
+                f"{self.path} was made with the area classes {', '.join(settings.area)}; leave area away, or make "
+                "another map"
+            )
 
     @property
     def crs(self) -> pyproj.CRS:
@@ -165,8 +171,8 @@ class MapStore:
         InputError
             If there is no map yet, and no CRS was given.
         """
-        if self._there():
-            with self._opened("ro") as (_, settings):
+        if self._file.is_there():
+            with self._opened() as (_, settings):
                 return settings.crs
         if self._crs is None:
             raise InputError(f"{self.path} does not exist; give the CRS that it is to be made in (--crs)")
@@ -210,9 +216,10 @@ class MapStore:
                 f"there is no option {min(unknown)!r} here; the options are {', '.join(sorted(_READING))}"
             )
         layers = as_local_maps(local_maps, "local_maps")
-        new = not self._there()
-        with self._writing() as connection:
-            settings = None if new else read_settings(connection, self.path)
+        with self._file.writing() as connection:
+            settings = None if is_empty(connection) else read_settings(connection, self.path)
+            if settings is not None:
+                self._agree(settings)
             chosen = self._options(settings, options)
             crs = self._crs if settings is None else settings.crs
             evidence, crs = read_evidence(layers, chosen, crs)
@@ -231,7 +238,7 @@ class MapStore:
             If the map cannot be written; it is as it was then.
         """
         self._check_there()
-        with self._writing() as connection:
+        with self._file.writing() as connection:
             settings = read_settings(connection, self.path)
             if connection.execute("SELECT 1 FROM instances WHERE drawn IS NULL").fetchone() is None:
                 return None
@@ -256,7 +263,7 @@ class MapStore:
         OptionError
             If there is no such revision.
         """
-        with self._opened("ro") as (connection, settings):
+        with self._opened() as (connection, settings):
             if revision is None:
                 return read_elements(connection, settings).reset_index()
             self._check_revision(connection, revision)
@@ -271,7 +278,7 @@ class MapStore:
 
     def history(self) -> pd.DataFrame:
         """Return the revisions: number, time, source, what was new and what changed, and who wrote it."""
-        with self._opened("ro") as (connection, _):
+        with self._opened() as (connection, _):
             return pd.read_sql_query("SELECT * FROM revisions ORDER BY number", connection)
 
     def changes(self, since: int = 0) -> gpd.GeoDataFrame:
@@ -289,7 +296,7 @@ class MapStore:
             ``retired``, ``merged``), `revision` (of the last change), `moved_m` (median distance between what it was
             and what it is, metres), the attributes of an element, and the geometry: as it is now, or as it last was.
         """
-        with self._opened("ro") as (connection, settings):
+        with self._opened() as (connection, settings):
             if since:
                 self._check_revision(connection, since)
             names = ", ".join(f'"{name}"' for name in ELEMENT)
@@ -340,7 +347,7 @@ class MapStore:
         list of str
             What is wrong, in sentences; none where all is right.
         """
-        with self._opened("ro") as (connection, _):
+        with self._opened() as (connection, _):
             return faults(connection)
 
     def _add(
@@ -398,45 +405,15 @@ class MapStore:
         given = {} if self._proximity is None else {"proximity": self._proximity}
         return Options.of(area=self._area, **given, **options)
 
-    def _there(self) -> bool:
-        return self.path.exists() and self.path.stat().st_size > 0
-
     def _check_there(self) -> None:
-        if not self._there():
+        if not self._file.is_there():
             raise InputError(f"{self.path} does not exist yet; the first update makes it")
 
     @contextlib.contextmanager
-    def _opened(self, mode: str) -> Iterator[tuple[sqlite3.Connection, Settings]]:
+    def _opened(self) -> Iterator[tuple[Connection, Settings]]:
         self._check_there()
-        with _told(self.path), contextlib.closing(connect(self.path, mode)) as connection:
+        with self._file.reading() as connection:
             yield connection, read_settings(connection, self.path)
-
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        """Give the file within a transaction; a new file is gone again where anything fails."""
-        new = not self._there()
-        try:
-            with (
-                _told(self.path, writing=True),
-                contextlib.closing(connect(self.path, "rwc" if new else "rw")) as connection,
-            ):
-                if new:
-                    # These are no part of a transaction.
-                    stamp(connection)
-                with transaction(connection):
-                    yield connection
-        except BaseException:
-            if new:
-                self._clear_away()
-            raise
-
-    def _clear_away(self) -> None:
-        """Remove a file that no map came of."""
-        with contextlib.suppress(sqlite3.Error, OSError, InputError):
-            with contextlib.closing(connect(self.path, "ro")) as connection:
-                tables = connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0]
-            if not tables:
-                self.path.unlink()
 
     def _check_revision(self, connection: sqlite3.Connection, revision: int) -> None:
         (last,) = connection.execute("SELECT ifnull(MAX(number), 0) FROM revisions").fetchone()
@@ -478,27 +455,3 @@ def _count(connection: sqlite3.Connection, table: str) -> int:
 def now() -> str:
     """Return the time as GeoPackage has it."""
     return dt.datetime.now(dt.timezone.utc).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
-
-
-@contextlib.contextmanager
-def _told(path: Path, *, writing: bool = False) -> Iterator[None]:
-    """Tell what SQLite has to say in the user's words."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        kind = OutputError if writing else InputError
-        raise kind(_explained(path, str(error), writing=writing)) from error
-
-
-def _explained(path: Path, message: str, *, writing: bool) -> str:
-    whole = "; the map is as it was" if writing else ""
-    known = {
-        "database is locked": f"{path} is in use by another program (waited {PATIENCE_S:g} s); try again",
-        "database or disk is full": f"{path}: the disk is full; make room and run the update again",
-        "attempt to write a readonly database": f"{path} cannot be written; check the permissions of file and folder",
-        "unable to open database file": f"{path} cannot be opened; check the folder and its permissions",
-        "file is not a database": f"{path} is no GeoPackage",
-        "database disk image is malformed": f"{path} is damaged; restore it from a copy",
-        "disk I/O error": f"{path}: the disk cannot be read or written",
-    }
-    return known.get(message, f"{path}: {message}") + whole

@@ -174,15 +174,21 @@ def read_settings(connection: sqlite3.Connection, path: Path) -> Settings:
             f"{path} is no stored map: it has no table map_settings; make one with --create, or merge into this file "
             "with --main-map"
         )
-    held: dict[str, Any] = {
-        name: json.loads(value) for name, value in connection.execute("SELECT name, value FROM map_settings")
-    }
-    if held["format"] > FORMAT:
+    held = dict(connection.execute("SELECT name, value FROM map_settings").fetchall())
+
+    def setting(name: str) -> Any:
+        try:
+            return json.loads(held[name])
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(f"{path} is damaged: its setting {name} cannot be read; restore it from a copy") from error
+
+    number = setting("format")
+    if number > FORMAT:
         raise InputError(
-            f"{path} was written by a later version of PolyMerge (format {held['format']}, this one knows {FORMAT}); "
+            f"{path} was written by a later version of PolyMerge (format {number}, this one knows {FORMAT}); "
             "update PolyMerge"
         )
-    return Settings(parse_crs(held["crs"]), held["srs_id"], held["proximity"], tuple(held["area"]))
+    return Settings(parse_crs(setting("crs")), setting("srs_id"), setting("proximity"), tuple(setting("area")))
 
 
 @cache
