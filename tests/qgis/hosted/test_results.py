@@ -373,10 +373,16 @@ class TestStyle:
             "evaluated",
             "evaluated_areas",
             "measures",
+            "stored_map",
+            "stored_map_areas",
+            "changes",
+            "changes_areas",
+            "moves",
         ],
     )
     def test_loads_without_a_word(self, feedback, style):
-        areas = dict.fromkeys(("merged_areas", "instances", "evaluated_areas"), "Polygon")
+        polygons = ("merged_areas", "instances", "evaluated_areas", "stored_map_areas", "changes_areas")
+        areas = dict.fromkeys(polygons, "Polygon")
         tables = dict.fromkeys(("left_out", "id_aliases", "measures"), "None")
         kind = (areas | tables).get(style, "LineString")
         given = memory_layer([], kind=kind, columns="field=class:string&field=component:integer")
