@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from qgis.core import (
+    Qgis,
     QgsDateTimeRange,
     QgsFeatureRequest,
     QgsProcessingContext,
@@ -15,9 +16,9 @@ from qgis.core import (
     QgsProcessingUtils,
     QgsProject,
     QgsRenderContext,
+    QgsTemporalUtils,
     QgsVectorLayer,
     QgsVectorLayerTemporalContext,
-    QgsVectorLayerTemporalProperties,
     QgsWkbTypes,
 )
 from qgis.PyQt.QtCore import QDateTime, Qt
@@ -80,6 +81,7 @@ def lines(update, file, context):
     layer = QgsVectorLayer(stored_map.address(file, "line"), "my map", "ogr")
     assert context.project().addMapLayer(layer, False) is layer
     assert layer.featureCount() == 2
+    context.setLayersToLoadOnCompletion({})
     return layer
 
 
@@ -125,9 +127,10 @@ class TestUpdating:
 
     def test_with_footprints_retires_what_is_not_seen_any_more(self, update):
         update(looks("march", 0.0, 6.0), INSTANCES=footprints("march"))
-        later = []
-        for drive in ("april", "may", "june", "july"):
-            later.append(update(looks(drive, 0.0, time=APRIL), INSTANCES=footprints(drive)))
+        later = [
+            update(looks(drive, 0.0, time=APRIL), INSTANCES=footprints(drive))
+            for drive in ("april", "may", "june", "july")
+        ]
         assert sum(each["RETIRED"] for each in later) == 1
         assert later[-1]["ELEMENTS"] == 1
 
@@ -141,7 +144,7 @@ class TestUpdating:
         (row,) = table(QgsVectorLayer(results["OUTPUT"], "m", "ogr"))
         assert row["class"] == "kerb"
         settings = dict(sqlite3.connect(file).execute("SELECT name, value FROM map_settings").fetchall())
-        assert (json.loads(settings["proximity"]), json.loads(settings["area"])) == (2.5, ["island", "lawn"])
+        assert (json.loads(settings["proximity"]), json.loads(settings["area"])) == (2.5, ["island", "lawn", "ped_crossing"])
         assert QgsVectorLayer(results["OUTPUT"], "m", "ogr").crs().authid() == "EPSG:25832"
         assert json.loads(report.read_text())["revision"] == 1
         again = update(looks("march", 0.0))
@@ -315,8 +318,7 @@ class TestTime:
     def test_the_layer_knows_when_each_element_was_seen(self, layer):
         properties = layer.temporalProperties()
         assert properties.isActive()
-        fields = QgsVectorLayerTemporalProperties.TemporalMode.ModeFeatureDateTimeStartAndEndFromFields
-        assert properties.mode() == fields
+        assert properties.mode() == Qgis.VectorTemporalMode.FeatureDateTimeStartAndEndFromFields
         assert (properties.startField(), properties.endField()) == ("first_seen", "last_seen")
 
     @pytest.mark.parametrize(
@@ -337,8 +339,9 @@ class TestTime:
         found = [feature.geometry().boundingBox().yMinimum() - NORTH for feature in layer.getFeatures(wanted)]
         assert sorted(round(each) for each in found) == seen
 
-    def test_the_controller_finds_its_range(self, layer):
-        extent = layer.temporalProperties().calculateTemporalExtent(layer)
+    def test_the_controller_finds_its_range(self, layer, context):
+        assert layer.id() in context.project().mapLayers()
+        extent = QgsTemporalUtils.calculateTemporalRangeForProject(context.project())
         assert extent.begin().toUTC().toString(Qt.DateFormat.ISODate) == MARCH
         assert extent.end().toUTC().toString(Qt.DateFormat.ISODate) == APRIL
 
