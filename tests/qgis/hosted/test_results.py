@@ -188,6 +188,15 @@ class TestWhatIsNotThere:
         write(path, "elements", ELEMENT_COLUMNS, [], kind=QgsWkbTypes.Type.Unknown)
         assert send(result, "memory:", path)[1].wkbType() == kind
 
+    def test_lines_and_areas_of_one_layer_come_apart(self, send, tmp_path):
+        path = tmp_path / "mixed.gpkg"
+        square = f"POLYGON(({EAST} {NORTH}, {EAST + 5} {NORTH}, {EAST + 5} {NORTH + 5}, {EAST} {NORTH}))"
+        write(path, "elements", ELEMENT_COLUMNS, ELEMENTS, [LINES[0], square], kind=QgsWkbTypes.Type.Unknown)
+        assert [row["element_id"] for row in table(send(OUTPUT, "memory:", path)[1])] == ["a1"]
+        _, areas = send(AREAS, "memory:", path)
+        assert [row["element_id"] for row in table(areas)] == ["b2"]
+        assert areas.wkbType() == QgsWkbTypes.Type.Polygon
+
     def test_areas_alone_come_out_as_areas_and_leave_no_lines(self, send, tmp_path):
         path = tmp_path / "areas.gpkg"
         square = f"POLYGON(({EAST} {NORTH}, {EAST + 5} {NORTH}, {EAST + 5} {NORTH + 5}, {EAST} {NORTH}))"
