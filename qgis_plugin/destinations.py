@@ -26,13 +26,7 @@ class Place(NamedTuple):
 
     def replaces(self, other: Place) -> bool:
         """Whether writing to this place destroys what is at the other one."""
-        return self._is_in_file_of(other) and (self.whole or self.table == other.table)
-
-    def _is_in_file_of(self, other: Place) -> bool:
-        if os.path.realpath(self.file) == os.path.realpath(other.file):
-            return True
-        # A file system may take names for the same that are not.
-        return Path(self.file).exists() and Path(other.file).exists() and Path(self.file).samefile(other.file)
+        return same_file(self.file, other.file) and (self.whole or self.table == other.table)
 
     @property
     def folder_fault(self) -> str:
@@ -41,6 +35,14 @@ class Place(NamedTuple):
         if not folder.is_dir():
             return "there is no such folder"
         return "" if os.access(folder, os.W_OK) else "its folder is not writable"
+
+
+def same_file(one: str, other: str) -> bool:
+    """Whether two paths lead to one file, which need not be there yet."""
+    if os.path.realpath(one) == os.path.realpath(other):
+        return True
+    # A file system may take names for the same that are not.
+    return Path(one).exists() and Path(other).exists() and Path(one).samefile(other)
 
 
 def destination_text(value: Any, context: QgsProcessingContext) -> str:

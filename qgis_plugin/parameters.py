@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from qgis.core import (
+    NULL,
     QgsCoordinateReferenceSystem,
     QgsProcessing,
     QgsProcessingAlgorithm,
@@ -41,6 +42,11 @@ _AREAS = QgsProcessing.SourceType.TypeVectorPolygon
 _ANY = QgsProcessing.SourceType.TypeVectorAnyGeometry
 _TABLE = QgsProcessing.SourceType.TypeVector
 
+#: The filter of the files that hold a stored map.
+_MAPS = "GeoPackage (*.gpkg)"
+
+_MOST_REVISIONS = 2**31 - 1
+
 
 def explained(definition: _Definition, text: str, *, advanced: bool = False) -> _Definition:
     """Give a definition its help, and its place among the rare options."""
@@ -56,14 +62,10 @@ def with_decimals(definition: _Definition) -> _Definition:
     return definition
 
 
-def layer_parameters() -> list[QgsProcessingParameterDefinition]:
-    """Return what merging and looking at the network read, and how near is near."""
+def layers_parameter() -> list[QgsProcessingParameterDefinition]:
+    """Return the layers of local maps, and whether their selection is meant."""
     layers = QgsProcessingParameterMultipleLayers("LOCAL_MAPS", tr("Layers to merge"), layerType=_ANY)
     layers.setMinimumNumberInputs(1)
-    proximity = QgsProcessingParameterDistance(
-        "PROXIMITY", tr("Proximity"), defaultValue=1.0, parentParameterName="", minValue=0.0, maxValue=1000.0
-    )
-    proximity.setDefaultUnit(QgsUnitTypes.DistanceUnit.DistanceMeters)
     return [
         explained(
             layers,
@@ -78,8 +80,15 @@ def layer_parameters() -> list[QgsProcessingParameterDefinition]:
             tr("Of layers with a selection, take the selected features; of the others all."),
             advanced=False,
         ),
+    ]
+
+
+def layer_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return what merging and looking at the network read, and how near is near."""
+    return [
+        *layers_parameter(),
         explained(
-            with_decimals(proximity),
+            _proximity(tr("Proximity"), 1.0),
             tr(
                 "Lines that run nearer to each other than this are taken for the same element; by the method "
                 "polymerge, lines that come so near anywhere. In metres on the ground, whatever the CRS of the layers; "
@@ -89,6 +98,70 @@ def layer_parameters() -> list[QgsProcessingParameterDefinition]:
         explained(
             QgsProcessingParameterVectorLayer("MAIN_MAP", tr("Main map"), types=[_LINES, _AREAS], optional=True),
             tr("An earlier result to merge into; its elements keep their ids."),
+        ),
+    ]
+
+
+def _proximity(title: str, default: float | None) -> QgsProcessingParameterDistance:
+    """Return how near is near; without a default it may be left empty."""
+    definition = QgsProcessingParameterDistance(
+        "PROXIMITY", title, default, parentParameterName="", optional=default is None, minValue=0.0, maxValue=1000.0
+    )
+    definition.setDefaultUnit(QgsUnitTypes.DistanceUnit.DistanceMeters)
+    return with_decimals(definition)
+
+
+def stored_map_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return the file of a stored map, and what holds for one that is made."""
+    return [
+        file_parameter(
+            "MAP",
+            tr("Map"),
+            tr("The file of a stored map. To make one, write a name that is not taken yet and ends in .gpkg."),
+            kinds=_MAPS,
+        ),
+        switch_parameter(
+            "CREATE",
+            tr("Make the map if there is none"),
+            tr("Otherwise a name that is not there is an error, so that no map is made by mistake."),
+            default=True,
+            advanced=False,
+        ),
+        explained(
+            _proximity(tr("Proximity of a new map"), None),
+            tr(
+                "How near is near in a map that is made, in metres on the ground; empty: 1 m. A map keeps the one that "
+                "it was made with."
+            ),
+            advanced=True,
+        ),
+        explained(
+            QgsProcessingParameterCrs("CRS", tr("CRS of a new map, and of layers without one"), optional=True),
+            tr(
+                "A projected CRS in metres. Empty: a new map is in that of the first layer where it is one, else in "
+                "one centred on the data. Layers that have a CRS are not touched by it."
+            ),
+            advanced=True,
+        ),
+        local_crs_parameter(),
+        _strict_parameter(),
+    ]
+
+
+def changes_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return the file of a stored map, and since when its changes are asked for."""
+    since = QgsProcessingParameterNumber(
+        "SINCE",
+        tr("Since revision"),
+        type=QgsProcessingParameterNumber.Type.Integer,
+        defaultValue=0,
+        minValue=0,
+        maxValue=_MOST_REVISIONS,
+    )
+    return [
+        file_parameter("MAP", tr("Map"), tr("The file of a stored map, which “Update map” makes."), kinds=_MAPS),
+        explained(
+            since, tr("The map as it was at this revision is compared with the map as it is; 0 is the empty map.")
         ),
     ]
 
@@ -162,12 +235,17 @@ def crs_parameters() -> list[QgsProcessingParameterDefinition]:
             tr("Says where layers without a CRS lie; layers that have one are not touched by it."),
             advanced=True,
         ),
-        switch_parameter(
-            "LOCAL_CRS",
-            tr("Layers without a CRS are in plain metres"),
-            tr("Their coordinates are metres that lie nowhere on Earth; nothing is reprojected."),
-        ),
+        local_crs_parameter(),
     ]
+
+
+def local_crs_parameter() -> QgsProcessingParameterBoolean:
+    """Return that layers without a CRS lie nowhere."""
+    return switch_parameter(
+        "LOCAL_CRS",
+        tr("Layers without a CRS are in plain metres"),
+        tr("Their coordinates are metres that lie nowhere on Earth; nothing is reprojected."),
+    )
 
 
 def map_parameters() -> list[QgsProcessingParameterDefinition]:
@@ -186,12 +264,16 @@ def map_parameters() -> list[QgsProcessingParameterDefinition]:
             tr("Empty: that of the main map, else that of the first layer."),
             advanced=True,
         ),
-        switch_parameter(
-            "STRICT",
-            tr("Stop at a feature that cannot be used"),
-            tr("Otherwise such features are left out, and listed there with the reason."),
-        ),
+        _strict_parameter(),
     ]
+
+
+def _strict_parameter() -> QgsProcessingParameterBoolean:
+    return switch_parameter(
+        "STRICT",
+        tr("Stop at a feature that cannot be used"),
+        tr("Otherwise such features are left out, and listed there with the reason."),
+    )
 
 
 def share_parameter(name: str, title: str, text: str, *, default: float) -> QgsProcessingParameterNumber:
@@ -222,9 +304,11 @@ def choice_parameter(
     return explained(choice, text, advanced=advanced)
 
 
-def switch_parameter(name: str, title: str, text: str, *, advanced: bool = True) -> QgsProcessingParameterBoolean:
+def switch_parameter(
+    name: str, title: str, text: str, *, default: bool = False, advanced: bool = True
+) -> QgsProcessingParameterBoolean:
     """Return something that is off unless the user wants it."""
-    return explained(QgsProcessingParameterBoolean(name, title, defaultValue=False), text, advanced=advanced)
+    return explained(QgsProcessingParameterBoolean(name, title, defaultValue=default), text, advanced=advanced)
 
 
 def text_parameter(
@@ -366,7 +450,7 @@ def _as_text(
     kind: str, name: str, algorithm: QgsProcessingAlgorithm, parameters: dict[str, Any], context: QgsProcessingContext
 ) -> str:
     if kind in {"number", "distance"}:
-        return repr(algorithm.parameterAsDouble(parameters, name, context))
+        return _number_text(name, algorithm, parameters, context)
     if kind == "crs":
         return crs_text(algorithm.parameterAsCrs(parameters, name, context))
     if kind == "enum":
@@ -375,3 +459,14 @@ def _as_text(
     if kind == "file":
         return absolute_file(algorithm, parameters, name, context)
     return str(algorithm.parameterAsString(parameters, name, context))
+
+
+def _number_text(
+    name: str, algorithm: QgsProcessingAlgorithm, parameters: dict[str, Any], context: QgsProcessingContext
+) -> str:
+    definition = algorithm.parameterDefinition(name)
+    if all(each in (None, NULL) for each in (parameters.get(name), definition.defaultValue())):
+        return ""
+    if definition.dataType() == QgsProcessingParameterNumber.Type.Integer:
+        return repr(algorithm.parameterAsInt(parameters, name, context))
+    return repr(algorithm.parameterAsDouble(parameters, name, context))

@@ -8,10 +8,12 @@ from qgis.PyQt import sip
 from qgis.PyQt.QtGui import QIcon
 
 from .algorithms.evaluate_map import EvaluateMap
+from .algorithms.map_changes import MapChanges
 from .algorithms.merge_local_maps import MergeLocalMaps
 from .algorithms.merge_network import MergeNetwork
 from .algorithms.project_local_maps import ProjectLocalMaps
 from .algorithms.set_up import SetUp
+from .algorithms.update_map import UpdateMap
 from .environment import SETTING
 from .layout import icon_path, metadata
 from .styling import Style
@@ -60,14 +62,15 @@ class PolyMergeProvider(QgsProcessingProvider):
 
     def loadAlgorithms(self) -> None:
         """Add the algorithms."""
-        for algorithm in (SetUp, ProjectLocalMaps, MergeLocalMaps, MergeNetwork, EvaluateMap):
+        algorithms = (SetUp, ProjectLocalMaps, MergeLocalMaps, MergeNetwork, EvaluateMap, UpdateMap, MapChanges)
+        for algorithm in algorithms:
             self.addAlgorithm(algorithm())
 
-    def style(self, name: str) -> Style:
+    def style(self, name: str, *, grows: bool = False) -> Style:
         """Return a layer style, as something that QGIS calls when it has loaded a layer."""
         # QGIS calls it when the algorithm is gone, and deletes it after the run; until then somebody has to keep it.
         # Runs in several threads ask at the same time, so that the set is changed in place.
-        style = Style(name)
+        style = Style(name, grows=grows)
         self._styles.difference_update([each for each in tuple(self._styles) if sip.isdeleted(each)])
         self._styles.add(style)
         return style

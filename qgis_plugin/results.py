@@ -42,7 +42,7 @@ _WKB_TYPES = {
     "polygon": QgsWkbTypes.Type.Polygon,
     "table": QgsWkbTypes.Type.NoGeometry,
 }
-
+_GEOMETRIES = {"line": "LineString", "polygon": "Polygon"}
 
 #: QGIS takes an empty layer that may hold any kind of geometry for a table.
 _SAYS_NOTHING = (QgsWkbTypes.Type.Unknown, QgsWkbTypes.Type.NoGeometry)
@@ -137,15 +137,21 @@ def deliver(
 
 
 def _layers_of(file: Path, result: Result) -> list[str]:
-    """Return the layers of the worker that hold what belongs in a result: areas alone are in its layer `elements`."""
+    """Return the layers of the worker that hold what belongs in a result: areas alone are in its layer `elements`.
+
+    Of a layer of lines and polygons those that belong in it are asked for as QGIS has it, ``NAME|geometrytype=KIND``.
+    """
     metadata = QgsProviderRegistry.instance().providerMetadata("ogr")
     found = {each.name(): each for each in metadata.querySublayers(str(file))}
     areas = QgsWkbTypes.GeometryType.PolygonGeometry
-    return [
-        name
-        for name in result.layers
-        if name in found and (QgsWkbTypes.geometryType(found[name].wkbType()) == areas) == (result.kind == "polygon")
-    ]
+    layers = []
+    for name in result.layers:
+        kind = found[name].wkbType() if name in found else None
+        if kind == QgsWkbTypes.Type.Unknown and result.kind in _GEOMETRIES:
+            layers.append(f"{name}|geometrytype={_GEOMETRIES[result.kind]}")
+        elif kind is not None and (QgsWkbTypes.geometryType(kind) == areas) == (result.kind == "polygon"):
+            layers.append(name)
+    return layers
 
 
 def _open(file: Path, layer: str) -> QgsVectorLayer:

@@ -30,11 +30,13 @@ class Style(QgsProcessingLayerPostProcessorInterface):
     ----------
     name : str
         Name of a file in `resources/styles`.
+    grows : bool, default False
+        Whether classes may come into the layer later, so that those of the style stay that are not in it yet.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, *, grows: bool = False) -> None:
         super().__init__()
-        self._name = name
+        self._name, self._grows = name, grows
 
     def postProcessLayer(
         self, layer: QgsMapLayer, context: QgsProcessingContext, feedback: QgsProcessingFeedback
@@ -46,12 +48,15 @@ class Style(QgsProcessingLayerPostProcessorInterface):
         message, loaded = layer.loadNamedStyle(style_path(self._name))
         if not loaded:
             feedback.pushWarning(message)
-        name_classes(layer)
+        name_classes(layer, keep_all=self._grows)
         layer.triggerRepaint()
 
 
-def name_classes(layer: QgsVectorLayer) -> None:
-    """Give each class that the style does not know a category of its own, as far as a legend can hold them."""
+def name_classes(layer: QgsVectorLayer, *, keep_all: bool = False) -> None:
+    """Give each class that the style does not know a category of its own, as far as a legend can hold them.
+
+    Categories of classes that are not there go, unless all are to be kept.
+    """
     renderer = layer.renderer()
     if not isinstance(renderer, QgsCategorizedSymbolRenderer):
         return
@@ -67,7 +72,7 @@ def name_classes(layer: QgsVectorLayer) -> None:
         symbol = others.symbol().clone()
         symbol.setColor(QColor.fromHsv((_FIRST_HUE + number * _GOLDEN_ANGLE) % 360, 200, 170))
         named.addCategory(QgsRendererCategory(name, symbol, name))
-    for category in reversed(range(len(categories))):
+    for category in reversed(range(0 if keep_all else len(categories))):
         if str(categories[category].value()) not in present:
             named.deleteCategory(category)
     layer.setRenderer(named)

@@ -130,7 +130,7 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
     COMMAND = ""
     #: The parameters that are options of the command.
     OPTIONS: tuple[str, ...] = ()
-    #: The option that names the file of layers.
+    #: The option that names the file of layers; empty where the command writes none.
     LAYERS_OPTION = "--output"
     #: Outputs that are numbers, with the text that describes them.
     NUMBERS: tuple[tuple[str, str], ...] = ()
@@ -253,7 +253,7 @@ class WorkerAlgorithm(PolyMergeAlgorithm):
                 if self.parameterAsFileOutput(parameters, each.parameter, context):
                     copies[each.parameter] = folder / f"file{each.suffix}"
                     options.append(f"{each.option}={copies[each.parameter]}")
-            targets = [f"{self.LAYERS_OPTION}={output}", f"--json={report}"]
+            targets = [*([f"{self.LAYERS_OPTION}={output}"] if self.LAYERS_OPTION else []), f"--json={report}"]
             arguments = [*options, *staged.options, *targets, "--", *staged.inputs]
             shown_as = {**staged.shown_as, f" -> {output}": ""}
             run_worker(self.COMMAND, arguments, Part(feedback, _STAGED, _WORKED), shown_as=shown_as)

@@ -18,6 +18,7 @@ import polymerge_core
 from polymerge_core import schema
 from polymerge_core.evaluation.result import MEASURE_COLUMNS
 from polymerge_core.figures import _COLOURS
+from polymerge_core.store.tables import ELEMENT
 from qgis_plugin import package
 
 if sys.version_info >= (3, 11):
@@ -37,6 +38,10 @@ ELEMENTS = {*schema.ELEMENT_COLUMNS, "elem_id", "n_obs", "n_inst"}
 EVALUATED = {"element_id", "class", "score", "length_m", "reference_id", "frechet_m", "iou", "beyond_share"}
 EVALUATED |= {"lateral_median_m", "lateral_p95_m"}
 
+#: The columns of a stored map, and of its changes.
+STORED = {"element_id", *ELEMENT}
+CHANGES = {*STORED, "kind", "revision", "moved_m"}
+
 COLUMNS = {
     "local_maps": {"class", "drive", "instance", "score", "timestamp"},
     "instances": {"drive", "instance", "timestamp_ns", "x", "y", "heading", "n_observations"},
@@ -51,6 +56,11 @@ COLUMNS = {
     "evaluated": EVALUATED,
     "evaluated_areas": EVALUATED,
     "measures": set(MEASURE_COLUMNS),
+    "stored_map": STORED,
+    "stored_map_areas": STORED,
+    "changes": CHANGES,
+    "changes_areas": CHANGES,
+    "moves": {"element_id", "moved_m"},
 }
 
 
@@ -290,7 +300,8 @@ def test_requirements_are_the_dependencies_of_the_package():
 
 class TestIcons:
     def test_there_is_one_for_the_plugin_and_each_algorithm(self):
-        assert [path.stem for path in ICONS] == ["evaluate", "merge", "network", "polymerge", "project", "setup"]
+        names = ["changes", "evaluate", "merge", "network", "polymerge", "project", "setup", "update"]
+        assert [path.stem for path in ICONS] == names
 
     @pytest.mark.parametrize("path", ICONS, ids=lambda path: path.stem)
     def test_is_a_small_plain_drawing(self, path):
@@ -330,7 +341,15 @@ class TestStyles:
         columns = [column.get("name") for column in style.iter("column") if column.get("hidden") == "0"]
         assert columns == list(schema.ELEMENT_COLUMNS)
 
-    @pytest.mark.parametrize("name", ["local_maps", "merged_map", "merged_areas"])
+    @pytest.mark.parametrize("name", ["changes", "changes_areas"])
+    def test_every_kind_of_change_is_drawn_in_a_colour_of_its_own(self, name):
+        style = ET.parse(ROOT / "resources" / "styles" / f"{name}.qml").getroot()
+        symbols = {symbol.get("name"): _colour(symbol) for symbol in style.iter("symbol")}
+        drawn = {category.get("value"): symbols[category.get("symbol")] for category in style.iter("category")}
+        assert set(drawn) == {"added", "moved", "changed", "retired", "merged"}
+        assert len(set(drawn.values())) == len(drawn)
+
+    @pytest.mark.parametrize("name", ["local_maps", "merged_map", "merged_areas", "stored_map", "stored_map_areas"])
     def test_classes_have_the_colours_of_the_pictures_and_any_other_class_is_drawn(self, name):
         style = ET.parse(ROOT / "resources" / "styles" / f"{name}.qml").getroot()
         symbols = {symbol.get("name"): _colour(symbol) for symbol in style.iter("symbol")}

@@ -43,10 +43,12 @@ RECORD = Record(Path(ORDERS["record"]))
 
 ALGORITHMS = {
     "polymerge:evaluatemap": "Evaluate map",
+    "polymerge:mapchanges": "Changes of a map",
     "polymerge:mergelocalmaps": "Merge local maps",
     "polymerge:mergenetwork": "Merge network",
     "polymerge:projectlocalmaps": "Project local maps",
     "polymerge:setup": "Set up PolyMerge",
+    "polymerge:updatemap": "Update map",
 }
 MERGE, NETWORK, PROJECT = "polymerge:mergelocalmaps", "polymerge:mergenetwork", "polymerge:projectlocalmaps"
 EVALUATE = "polymerge:evaluatemap"
@@ -95,7 +97,7 @@ def show_toolbox() -> None:
     names = {index: tree.algorithmForIndex(index) for index in _indexes()}
     own = {index: each for index, each in names.items() if each is not None and each.provider().id() == "polymerge"}
     found = {each.id(): each.displayName() for each in own.values()}
-    RECORD.check("the toolbox has the five algorithms", found == ALGORITHMS, found)
+    RECORD.check("the toolbox has all algorithms", found == ALGORITHMS, found)
     tree.collapseAll()
     for index in own:
         tree.expand(index.parent())

@@ -30,7 +30,7 @@ from qgis_plugin.layout import ROOT, metadata, style_path
 
 from .layers import EAST, NORTH, file_layer, memory_layer, track
 
-IDS = ("setup", "projectlocalmaps", "mergelocalmaps", "mergenetwork", "evaluatemap")
+IDS = ("setup", "projectlocalmaps", "mergelocalmaps", "mergenetwork", "evaluatemap", "updatemap", "mapchanges")
 WORKERS = IDS[1:]
 MERGERS = IDS[2:4]
 
@@ -140,6 +140,8 @@ class TestEvery:
             "mergelocalmaps": layers | {"INSTANCES", "AREAS", "LINEAGE", "LEFT_OUT", "ID_ALIASES"},
             "mergenetwork": layers | {"EDGES"},
             "evaluatemap": compared | {"OUTPUT", "EVALUATED", "EVALUATED_AREAS", "MEASURES", "PAGE"},
+            "updatemap": {"MAP", "LOCAL_MAPS", "SELECTED_ONLY", "INSTANCES", "CREATE", "CLASS_FIELD"},
+            "mapchanges": {"MAP", "SINCE", "CHANGES", "CHANGES_AREAS", "MOVES"},
         }
         assert plain == wanted[name]
 
@@ -152,6 +154,8 @@ class TestOutputs:
             ("mergelocalmaps", {"N_ELEMENTS", "N_OBSERVATIONS", "N_LEFT_OUT"}),
             ("mergenetwork", {"N_COMPONENTS", "N_OBSERVATIONS", "LARGEST_COMPONENT"}),
             ("evaluatemap", {"AVERAGE_PRECISION", "N_ELEMENTS", "N_REFERENCE"}),
+            ("updatemap", {"REVISION", "ELEMENTS", "SKIPPED", "ADDED", "CHANGED", "MOVED", "RETIRED", "MERGED"}),
+            ("mapchanges", {"ADDED", "CHANGED", "MOVED", "RETIRED", "MERGED"}),
         ],
     )
     def test_numbers_are_there_for_models(self, name, numbers):
@@ -166,7 +170,8 @@ class TestOutputs:
             for each in algorithm(name).parameterDefinitions()
             if isinstance(each, QgsProcessingParameterFeatureSink)
         ]
-        assert [each.name() for each in sinks if not each.flags() & optional] == ["OUTPUT"]
+        first = {"updatemap": [], "mapchanges": ["CHANGES"]}.get(name, ["OUTPUT"])
+        assert [each.name() for each in sinks if not each.flags() & optional] == first
         assert all(each.createByDefault() for each in sinks)
 
     @pytest.mark.parametrize("name", WORKERS)

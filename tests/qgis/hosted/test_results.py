@@ -188,6 +188,15 @@ class TestWhatIsNotThere:
         write(path, "elements", ELEMENT_COLUMNS, [], kind=QgsWkbTypes.Type.Unknown)
         assert send(result, "memory:", path)[1].wkbType() == kind
 
+    def test_lines_and_areas_of_one_layer_come_apart(self, send, tmp_path):
+        path = tmp_path / "mixed.gpkg"
+        square = f"POLYGON(({EAST} {NORTH}, {EAST + 5} {NORTH}, {EAST + 5} {NORTH + 5}, {EAST} {NORTH}))"
+        write(path, "elements", ELEMENT_COLUMNS, ELEMENTS, [LINES[0], square], kind=QgsWkbTypes.Type.Unknown)
+        assert [row["element_id"] for row in table(send(OUTPUT, "memory:", path)[1])] == ["a1"]
+        _, areas = send(AREAS, "memory:", path)
+        assert [row["element_id"] for row in table(areas)] == ["b2"]
+        assert areas.wkbType() == QgsWkbTypes.Type.Polygon
+
     def test_areas_alone_come_out_as_areas_and_leave_no_lines(self, send, tmp_path):
         path = tmp_path / "areas.gpkg"
         square = f"POLYGON(({EAST} {NORTH}, {EAST + 5} {NORTH}, {EAST + 5} {NORTH + 5}, {EAST} {NORTH}))"
@@ -373,10 +382,16 @@ class TestStyle:
             "evaluated",
             "evaluated_areas",
             "measures",
+            "stored_map",
+            "stored_map_areas",
+            "changes",
+            "changes_areas",
+            "moves",
         ],
     )
     def test_loads_without_a_word(self, feedback, style):
-        areas = dict.fromkeys(("merged_areas", "instances", "evaluated_areas"), "Polygon")
+        polygons = ("merged_areas", "instances", "evaluated_areas", "stored_map_areas", "changes_areas")
+        areas = dict.fromkeys(polygons, "Polygon")
         tables = dict.fromkeys(("left_out", "id_aliases", "measures"), "None")
         kind = (areas | tables).get(style, "LineString")
         given = memory_layer([], kind=kind, columns="field=class:string&field=component:integer")

@@ -10,8 +10,10 @@ ALGORITHMS = {
     "mergelocalmaps": "Merge local maps",
     "mergenetwork": "Merge network",
     "evaluatemap": "Evaluate map",
+    "mapchanges": "Changes of a map",
     "projectlocalmaps": "Project local maps",
     "setup": "Set up PolyMerge",
+    "updatemap": "Update map",
 }
 
 

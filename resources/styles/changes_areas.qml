@@ -1,0 +1,163 @@
+<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
+<qgis version="3.22.0" styleCategories="Symbology|Fields|Forms|AttributeTable">
+  <renderer-v2 type="categorizedSymbol" symbollevels="1" referencescale="-1" enableorderby="0" attr="kind" forceraster="0">
+    <categories>
+      <category label="Added" value="added" render="true" symbol="0" />
+      <category label="Moved" value="moved" render="true" symbol="1" />
+      <category label="Changed" value="changed" render="true" symbol="2" />
+      <category label="Retired" value="retired" render="true" symbol="3" />
+      <category label="Merged into another" value="merged" render="true" symbol="4" />
+    </categories>
+    <symbols>
+      <symbol type="fill" clip_to_extent="1" name="0" force_rhr="0" alpha="1">
+        <layer locked="0" class="SimpleFill" pass="1" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="0,158,115,64" name="color" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="0,158,115,255" name="outline_color" />
+            <Option type="QString" value="solid" name="outline_style" />
+            <Option type="QString" value="1" name="outline_width" />
+            <Option type="QString" value="MM" name="outline_width_unit" />
+            <Option type="QString" value="solid" name="style" />
+          </Option>
+        </layer>
+      </symbol>
+      <symbol type="fill" clip_to_extent="1" name="1" force_rhr="0" alpha="1">
+        <layer locked="0" class="SimpleFill" pass="1" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="0,114,178,64" name="color" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="0,114,178,255" name="outline_color" />
+            <Option type="QString" value="solid" name="outline_style" />
+            <Option type="QString" value="1" name="outline_width" />
+            <Option type="QString" value="MM" name="outline_width_unit" />
+            <Option type="QString" value="solid" name="style" />
+          </Option>
+        </layer>
+      </symbol>
+      <symbol type="fill" clip_to_extent="1" name="2" force_rhr="0" alpha="1">
+        <layer locked="0" class="SimpleFill" pass="0" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="160,160,160,64" name="color" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="160,160,160,255" name="outline_color" />
+            <Option type="QString" value="solid" name="outline_style" />
+            <Option type="QString" value="0.4" name="outline_width" />
+            <Option type="QString" value="MM" name="outline_width_unit" />
+            <Option type="QString" value="solid" name="style" />
+          </Option>
+        </layer>
+      </symbol>
+      <symbol type="fill" clip_to_extent="1" name="3" force_rhr="0" alpha="1">
+        <layer locked="0" class="SimpleFill" pass="1" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="213,94,0,64" name="color" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="213,94,0,255" name="outline_color" />
+            <Option type="QString" value="dash" name="outline_style" />
+            <Option type="QString" value="1" name="outline_width" />
+            <Option type="QString" value="MM" name="outline_width_unit" />
+            <Option type="QString" value="solid" name="style" />
+          </Option>
+        </layer>
+      </symbol>
+      <symbol type="fill" clip_to_extent="1" name="4" force_rhr="0" alpha="1">
+        <layer locked="0" class="SimpleFill" pass="1" enabled="1">
+          <Option type="Map">
+            <Option type="QString" value="204,121,167,64" name="color" />
+            <Option type="QString" value="round" name="joinstyle" />
+            <Option type="QString" value="204,121,167,255" name="outline_color" />
+            <Option type="QString" value="dash" name="outline_style" />
+            <Option type="QString" value="1" name="outline_width" />
+            <Option type="QString" value="MM" name="outline_width_unit" />
+            <Option type="QString" value="solid" name="style" />
+          </Option>
+        </layer>
+      </symbol>
+    </symbols>
+  </renderer-v2>
+  <fieldConfiguration>
+    <field name="moved_m" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+    <field name="score" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+    <field name="length_m" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+    <field name="sigma_m" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+    <field name="evidence" configurationFlags="None">
+      <editWidget type="Range">
+        <config>
+          <Option type="Map">
+            <Option type="int" value="2" name="Precision" />
+          </Option>
+        </config>
+      </editWidget>
+    </field>
+  </fieldConfiguration>
+  <aliases>
+    <alias name="Element" field="element_id" />
+    <alias name="Kind of change" field="kind" />
+    <alias name="Revision" field="revision" />
+    <alias name="Moved by (m)" field="moved_m" />
+    <alias name="Class" field="class" />
+    <alias name="Score" field="score" />
+    <alias name="Observations" field="n_observations" />
+    <alias name="Local maps" field="n_instances" />
+    <alias name="Length (m)" field="length_m" />
+    <alias name="Sigma (m)" field="sigma_m" />
+    <alias name="First seen" field="first_seen" />
+    <alias name="Last seen" field="last_seen" />
+    <alias name="State" field="state" />
+    <alias name="Evidence" field="evidence" />
+  </aliases>
+  <attributetableconfig actionWidgetStyle="dropDown" sortOrder="0" sortExpression="&quot;element_id&quot;">
+    <columns>
+      <column type="field" name="element_id" hidden="0" width="-1" />
+      <column type="field" name="kind" hidden="0" width="-1" />
+      <column type="field" name="revision" hidden="0" width="-1" />
+      <column type="field" name="moved_m" hidden="0" width="-1" />
+      <column type="field" name="class" hidden="0" width="-1" />
+      <column type="field" name="score" hidden="0" width="-1" />
+      <column type="field" name="n_observations" hidden="0" width="-1" />
+      <column type="field" name="n_instances" hidden="0" width="-1" />
+      <column type="field" name="length_m" hidden="0" width="-1" />
+      <column type="field" name="sigma_m" hidden="0" width="-1" />
+      <column type="field" name="first_seen" hidden="0" width="-1" />
+      <column type="field" name="last_seen" hidden="0" width="-1" />
+      <column type="field" name="state" hidden="0" width="-1" />
+      <column type="field" name="evidence" hidden="0" width="-1" />
+      <column type="field" name="fid" hidden="1" width="-1" />
+      <column type="actions" hidden="1" width="-1" />
+    </columns>
+  </attributetableconfig>
+  <layerGeometryType>2</layerGeometryType>
+</qgis>
