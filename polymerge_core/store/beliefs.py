@@ -29,6 +29,7 @@ from polymerge_core.consensus.looks import Instances
 from polymerge_core.consensus.support import SURE, chances
 from polymerge_core.curves import Array, Curves, Index, count_up
 from polymerge_core.observations import as_lines
+from polymerge_core.store.evidence import drives_in_order
 
 #: The chance that a local map shows something of a class at a place where there is nothing of it.
 FALSE_ALARM = 0.05
@@ -144,21 +145,6 @@ def judge_elements(
         return Judgement(evidence, [])
     renewals = _came_or_went(places, elements, stories, order, unit)
     return Judgement(evidence, renewals + _moved(places, elements, seen, observations, drive, order, unit))
-
-
-def drives_in_order(instances: gpd.GeoDataFrame) -> tuple[Index, Index]:
-    """Return the drive of each local map by its place in time, and the first local map (row) of each drive."""
-    held = pd.DataFrame(
-        {
-            "drive": instances["drive"].to_numpy(),
-            "time": instances["timestamp_ns"].astype("Float64").fillna(np.inf).to_numpy(dtype=float),
-            "revision": instances["revision"].to_numpy(),
-            "row": np.arange(len(instances)),
-        }
-    )
-    first = held.sort_values(["time", "revision", "row"]).drop_duplicates("drive").reset_index(drop=True)
-    number = pd.Series(first.index, index=first["drive"])
-    return number.reindex(held["drive"]).to_numpy(dtype=np.intp), first["row"].to_numpy(dtype=np.intp)
 
 
 def _places(elements: gpd.GeoDataFrame, area: NDArray[np.bool_], place: BaseGeometry, unit: float) -> Places:

@@ -28,6 +28,9 @@ from polymerge_core.store.tables import Settings
 
 _NAMES = ["drive", "instance"]
 
+#: Where very many looked, so many drives are heard in a square of so many proximities, and so many frames of each.
+_DRIVES, _FRAMES, _SQUARE = 16, 16, 30.0
+
 #: What the map is called beside the local maps.
 _MAP = "the stored map"
 
@@ -238,10 +241,41 @@ def read_context(connection: sqlite3.Connection, settings: Settings, place: Base
     near = geopackage.ids_near(connection, "instances", box)
     instances = _read(connection, settings, "instances", _INSTANCE, near, "fid")
     instances = instances[shapely.intersects(place, instances.geometry.to_numpy())]
+    instances = instances[_heard(instances, settings.proximity)]
     observations = _read(connection, settings, "observations", _OBSERVATION, instances.index.to_numpy(), "instance_fid")
     wide = shapely.total_bounds(observations.geometry.to_numpy()) if len(observations) else box
     changed = geopackage.ids_near(connection, "renewed", wide)
     return Context(instances, observations, _read(connection, settings, "renewed", _RENEWED, changed, "fid"))
+
+
+def drives_in_order(instances: gpd.GeoDataFrame) -> tuple[Index, Index]:
+    """Return the drive of each local map by its place in time, and the first local map (row) of each drive."""
+    held = pd.DataFrame(
+        {
+            "drive": instances["drive"].to_numpy(),
+            "time": instances["timestamp_ns"].astype("Float64").fillna(np.inf).to_numpy(dtype=float),
+            "revision": instances["revision"].to_numpy(),
+            "row": np.arange(len(instances)),
+        }
+    )
+    first = held.sort_values(["time", "revision", "row"]).drop_duplicates("drive").reset_index(drop=True)
+    number = pd.Series(first.index, index=first["drive"])
+    return number.reindex(held["drive"]).to_numpy(dtype=np.intp), first["row"].to_numpy(dtype=np.intp)
+
+
+def _heard(instances: gpd.GeoDataFrame, unit: float) -> NDArray[np.bool_]:
+    """Choose who is heard where very many looked: of each square the newest drives, of each drive some frames by lot.
+
+    The lot is the same at all times, so that a place is drawn from the same frames whoever draws it.
+    """
+    drive, _ = drives_in_order(instances)
+    middle = np.floor(shapely.get_coordinates(shapely.centroid(instances.geometry.to_numpy())) / (_SQUARE * unit))
+    lot = pd.util.hash_pandas_object(instances["drive"] + "\n" + instances["instance"], index=False).to_numpy()
+    held = pd.DataFrame({"x": middle[:, 0], "y": middle[:, 1], "drive": drive, "lot": lot})
+    among_frames = held.groupby(["x", "y", "drive"])["lot"].rank(method="first")
+    square = held.groupby(["x", "y"])["drive"]
+    newer = square.transform(lambda drives: drives.rank(method="dense", ascending=False))
+    return np.asarray((among_frames <= _FRAMES) & (newer <= _DRIVES))
 
 
 _INSTANCE = ("drive", "instance", "timestamp_ns", "x", "y", "heading", "has_footprint", "revision")

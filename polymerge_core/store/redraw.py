@@ -26,8 +26,8 @@ from polymerge_core.merge import merge
 from polymerge_core.observations import as_lines
 from polymerge_core.schema import NO_ELEMENT
 from polymerge_core.store import geopackage
-from polymerge_core.store.beliefs import SURE_OF, Renewal, drives_in_order, judge_elements
-from polymerge_core.store.evidence import Context, Pieces, read_context, still_valid
+from polymerge_core.store.beliefs import SURE_OF, Renewal, judge_elements
+from polymerge_core.store.evidence import Context, Pieces, drives_in_order, read_context, still_valid
 from polymerge_core.store.stitching import Chain, Piece, cut_at, put_together, shares
 from polymerge_core.store.tables import ELEMENT, Settings
 

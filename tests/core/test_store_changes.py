@@ -1,0 +1,188 @@
+"""What a stored map makes of a road that changes: lines that go, come and move, told by drives one after another."""
+
+from __future__ import annotations
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pytest
+import shapely
+from shapely import LineString, box
+
+import polymerge_core as pm
+
+CRS = "EPSG:32632"
+ORIGIN = np.array([500_000.0, 5_000_000.0])
+DAY_NS = 86_400_000_000_000
+
+
+def straight(y, start=0.0, stop=60.0):
+    return LineString(
+        ORIGIN + np.column_stack([np.arange(start, stop + 1, 4.0), np.full(len(np.arange(start, stop + 1, 4.0)), y)])
+    )
+
+
+def drive(number, *lines, frames=6, footprints=True, sigma=0.1, cls="divider"):
+    """Return what a drive sees: in each frame all lines, shifted a little."""
+    rng = np.random.default_rng(number)
+    rows, looked = [], []
+    shift = rng.normal(0, sigma, 2)
+    for frame in range(frames):
+        name = {"drive": f"d{number}", "instance": f"f{frame}"}
+        time = number * DAY_NS + frame * 1_000_000_000
+        for line in lines:
+            by = shift + rng.normal(0, sigma, 2)
+            seen = shapely.transform(line, lambda xy, by=by: xy + by)
+            rows.append({**name, "class": cls, "score": 0.9, "timestamp": time, "geometry": seen})
+        area = box(*(ORIGIN - [10, 20]), *(ORIGIN + [70, 20]))
+        looked.append(
+            {**name, "timestamp_ns": time, "x": ORIGIN[0] + 30, "y": ORIGIN[1], "heading": 90.0, "geometry": area}
+        )
+    columns = ["drive", "instance", "class", "score", "timestamp", "geometry"]
+    observations = gpd.GeoDataFrame(pd.DataFrame(rows, columns=columns), geometry="geometry", crs=CRS)
+    instances = gpd.GeoDataFrame(looked, geometry="geometry", crs=CRS).assign(n_observations=len(lines))
+    return pm.LocalMaps(observations, instances if footprints else None, source=f"d{number}")
+
+
+@pytest.fixture
+def store(tmp_path):
+    return pm.MapStore(tmp_path / "map.gpkg", create=True, crs=CRS)
+
+
+def heights(elements):
+    """Return how far to the north each element lies, from south to north."""
+    return sorted(round(float(shape.centroid.y - ORIGIN[1]), 1) for shape in elements.geometry)
+
+
+ROAD = (straight(-4), straight(0), straight(4))
+
+
+def test_a_line_that_two_drives_looked_for_in_vain_is_retired_and_can_be_had_back(store):
+    for number in range(3):
+        store.update(drive(number, *ROAD))
+    before = store.elements()
+    first = store.update(drive(3, ROAD[0], ROAD[2]))
+    assert heights(store.elements()) == pytest.approx([-4, 0, 4], abs=0.3)
+    second = store.update(drive(4, ROAD[0], ROAD[2]))
+    assert (first.retired, second.retired) == (0, 1)
+    assert heights(store.elements()) == pytest.approx([-4, 4], abs=0.3)
+    (gone,) = set(before["element_id"]) - set(store.elements()["element_id"])
+    changes = store.changes(3).set_index("element_id")
+    assert changes["kind"][gone] == "retired"
+    pd.testing.assert_frame_equal(pd.DataFrame(store.elements(3)), pd.DataFrame(before))
+    assert store.verify() == []
+
+
+def test_what_it_was_seen_by_is_listed_with_the_reason(store):
+    for number in range(3):
+        store.update(drive(number, *ROAD))
+    for number in (3, 4):
+        store.update(drive(number, ROAD[0], ROAD[2]))
+    left_out = pm.read_layers(store.path)["observations"]
+    assert len(left_out) == 3 * 6 * 3 + 2 * 6 * 2
+    with store._opened() as (connection, _):
+        rows = connection.execute("SELECT reason, COUNT(*) FROM left_out GROUP BY reason").fetchall()
+    assert dict(rows) == {"the road changed since": 18}
+
+
+def test_nothing_is_retired_where_nobody_knows_who_looked(store):
+    for number in range(3):
+        store.update(drive(number, *ROAD, footprints=False))
+    for number in range(3, 8):
+        store.update(drive(number, ROAD[0], ROAD[2], footprints=False))
+    assert heights(store.elements()) == pytest.approx([-4, 0, 4], abs=0.3)
+
+
+def test_a_line_painted_aside_keeps_its_id_and_lies_where_it_is_now(store):
+    wide = (straight(-8), *ROAD, straight(8))
+    for number in range(3):
+        store.update(drive(number, *wide))
+    before = store.elements()
+    for number in range(3, 6):
+        store.update(drive(number, *wide[:2], straight(0.8), *wide[3:]))
+    after = store.elements()
+    assert after["element_id"].tolist() == before["element_id"].tolist()
+    assert heights(after) == pytest.approx([-8, -4, 0.8, 4, 8], abs=0.2)
+    changes = store.changes(3)
+    moved = changes[changes["kind"] == "moved"]
+    assert moved["moved_m"].tolist() == pytest.approx([0.8], abs=0.25)
+    (arrow,) = store.moves(3).geometry
+    assert arrow.length == pytest.approx(0.8, abs=0.25)
+    start, end = arrow.coords
+    assert end[1] > start[1]
+
+
+def test_what_appears_is_there_however_many_drives_did_not_see_it(store):
+    for number in range(10):
+        store.update(drive(number, ROAD[0], ROAD[2]))
+    for number in (10, 11):
+        store.update(drive(number, *ROAD))
+    elements = store.elements()
+    assert heights(elements) == pytest.approx([-4, 0, 4], abs=0.3)
+    assert store.verify() == []
+
+
+def test_a_line_that_appears_is_sure_only_when_two_drives_saw_it(store):
+    for number in range(5):
+        store.update(drive(number, ROAD[0], ROAD[2]))
+    store.update(drive(5, *ROAD))
+    first = store.elements().set_index(store.elements().centroid.y.round() - ORIGIN[1])["state"]
+    assert first.get(0.0, "tentative") == "tentative"
+    store.update(drive(6, *ROAD))
+    second = store.elements()
+    middle = second[(second.centroid.y - ORIGIN[1]).abs() < 1]
+    assert middle["state"].tolist() == ["confirmed"]
+
+
+def test_a_late_report_of_a_drive_before_the_change_brings_nothing_back(store):
+    for number in (0, 1, 2):
+        store.update(drive(number, *ROAD))
+    for number in (5, 6):
+        store.update(drive(number, ROAD[0], ROAD[2]))
+    store.update(drive(3, *ROAD))
+    assert heights(store.elements()) == pytest.approx([-4, 4], abs=0.3)
+    assert store.verify() == []
+
+
+def test_a_line_that_vanished_comes_back_when_it_is_painted_again(store):
+    for number in range(3):
+        store.update(drive(number, *ROAD))
+    for number in (3, 4, 5):
+        store.update(drive(number, ROAD[0], ROAD[2]))
+    ids = set(store.elements()["element_id"])
+    for number in (6, 7):
+        store.update(drive(number, *ROAD))
+    elements = store.elements()
+    assert heights(elements) == pytest.approx([-4, 0, 4], abs=0.3)
+    (new,) = set(elements["element_id"]) - ids
+    assert new > max(ids)
+
+
+def test_part_of_a_line_vanishes_alone(store):
+    for number in range(3):
+        store.update(drive(number, *ROAD))
+    left = straight(0, 0, 24)
+    for number in (3, 4, 5):
+        store.update(drive(number, ROAD[0], left, ROAD[2]))
+    elements = store.elements()
+    middle = elements[(elements.centroid.y - ORIGIN[1]).abs() < 1]
+    assert middle.geometry.length.sum() == pytest.approx(24, abs=4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_road_that_stays_as_it_is_does_not_change(store, seed):
+    for number in range(10):
+        done = store.update(drive(100 * seed + number, *ROAD, sigma=0.2))
+    assert len(store.elements()) == 3
+    assert done.retired == done.moved == 0
+    assert pm.read_layers(store.path).get("renewed", []) is not None
+    with store._opened() as (connection, _):
+        assert connection.execute("SELECT COUNT(*) FROM renewed").fetchone()[0] == 0
+
+
+def test_a_place_that_very_many_looked_at_is_drawn_from_the_newest(store):
+    for number in range(20):
+        store.update(drive(number, *ROAD, frames=2))
+    assert heights(store.elements()) == pytest.approx([-4, 0, 4], abs=0.2)
+    assert store.elements()["n_instances"].max() == 40
+    assert store.verify() == []
