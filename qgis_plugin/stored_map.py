@@ -66,7 +66,9 @@ def map_fault(file: str, *, create: bool) -> str:
         return tr("A map is a GeoPackage: give the new one a name that ends in .gpkg, not {}.").format(path.name)
     if not path.parent.is_dir():
         return tr("The map cannot be made as {}: there is no such folder.").format(file)
-    return "" if os.access(path.parent, os.W_OK) else tr("The map cannot be made as {}: its folder is not writable.")
+    if not os.access(path.parent, os.W_OK):
+        return tr("The map cannot be made as {}: its folder is not writable.").format(file)
+    return ""
 
 
 def layers_of(project: QgsProject | None, file: str) -> list[QgsVectorLayer]:
