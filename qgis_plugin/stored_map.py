@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from qgis.core import (
@@ -16,7 +15,7 @@ from qgis.core import (
     QgsWkbTypes,
 )
 
-from .destinations import same_file
+from .destinations import Place, same_file
 from .staging import file_of, place_of_layer
 from .styling import Style
 from .translation import tr
@@ -64,9 +63,8 @@ def map_fault(file: str, *, create: bool) -> str:
         )
     if path.suffix.lower() != ".gpkg":
         return tr("A map is a GeoPackage: give the new one a name that ends in .gpkg, not {}.").format(path.name)
-    if not path.parent.is_dir():
-        return tr("The map cannot be made as {}: there is no such folder.").format(file)
-    return "" if os.access(path.parent, os.W_OK) else tr("The map cannot be made as {}: its folder is not writable.")
+    fault = Place(file).folder_fault
+    return tr("The map cannot be made as {}: {}. Choose another folder.").format(file, tr(fault)) if fault else ""
 
 
 def layers_of(project: QgsProject | None, file: str) -> list[QgsVectorLayer]:

@@ -29,6 +29,7 @@ from qgis_plugin import stored_map
 from qgis_plugin.algorithms.update_map import UpdateMap
 from qgis_plugin.layout import ROOT
 
+from .host import Recorder
 from .layers import EAST, NORTH, file_layer, memory_layer, table, track
 
 COLUMNS = "field=class:string&field=drive:string&field=instance:string&field=timestamp:datetime"
@@ -223,6 +224,30 @@ class TestFaults:
         with pytest.raises(QgsProcessingException, match="april"):
             update(bad, STRICT=True)
         assert table(QgsVectorLayer(stored_map.address(file, "line"), "m", "ogr")) == before
+
+
+class TestCancel:
+    def cancel(self, feedback):
+        feedback.on_text = lambda text: feedback.cancel() if text == "updating the map" else None
+
+    def test_leaves_the_map_as_it_was(self, update, lines, file, feedback):
+        self.cancel(feedback)
+        with pytest.raises(QgsProcessingException, match=r"^Cancelled; nothing was written\.$"):
+            update(looks("april", 40.0, time=APRIL))
+        assert sqlite3.connect(file).execute("SELECT COUNT(*) FROM revisions").fetchone() == (1,)
+        lines.reload()
+        assert lines.featureCount() == 2
+
+    def test_of_the_first_run_leaves_nothing_that_the_next_one_stumbles_over(
+        self, run, ready, file, feedback, provider
+    ):
+        self.cancel(feedback)
+        given = {"MAP": file, "LOCAL_MAPS": [looks("march", 0.0)]}
+        with pytest.raises(QgsProcessingException, match="Cancelled"):
+            run("updatemap", **given)
+        results, fine = provider.algorithm("updatemap").run(given, QgsProcessingContext(), Recorder())
+        assert fine
+        assert results["REVISION"] == 1
 
 
 class TestWhileTheProjectShowsIt:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import shapely
 
+from polymerge_core import MapStore
 from tests.cli.layers import EAST, NORTH, UTM, area, draw, line, noisy_copies
 from tests.qgis.process.comparing import assert_same, assert_same_merge, command_line, destinations, table
 from tests.qgis.process.running import Qgis
@@ -197,6 +198,27 @@ def test_an_evaluation_of_the_sample_is_that_of_the_command_line(
     elements = len(table(merged, "elements"))
     assert (done["N_ELEMENTS"], done["N_REFERENCE"]) == (elements, len(table(sample_folder / "reference.gpkg")))
     assert "<h2>divider</h2>" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_a_stored_map_and_its_changes_are_those_of_the_command_line(
+    qgis: Qgis, sample_folder: Path, tmp_path: Path
+) -> None:
+    local, expected, wanted = (tmp_path / f"{name}.gpkg" for name in ("local_maps", "expected", "wanted"))
+    predictions, poses = sample_folder / "predictions.json", sample_folder / "poses.csv"
+    command_line("project", predictions, "--poses", poses, "--crs", UTM, "-o", local)
+    command_line("update", expected, local, "--create")
+    command_line("changes", expected, "-o", wanted)
+    stored, changes = tmp_path / "town.gpkg", tmp_path / "changes.gpkg"
+    layers = {"LOCAL_MAPS": f"{local}|layername=local_maps", "INSTANCES": f"{local}|layername=instances"}
+
+    done = qgis.run("polymerge:updatemap", {"MAP": stored, **layers}).results
+    told = qgis.run("polymerge:mapchanges", {"MAP": stored, "CHANGES": changes}).results
+
+    assert (done["MAP"], done["REVISION"]) == (str(stored), 1)
+    assert table(stored, "elements").equals(table(expected, "elements"))
+    assert_same(told["CHANGES"], wanted, "changes")
+    assert done["ADDED"] == told["ADDED"] == len(table(expected, "elements"))
+    assert MapStore(stored).verify() == []
 
 
 @pytest.fixture(scope="module")
