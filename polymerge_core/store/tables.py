@@ -163,7 +163,7 @@ def read_settings(connection: sqlite3.Connection, path: Path) -> Settings:
     Raises
     ------
     InputError
-        If the file is no stored map, or one of a later version.
+        If the file is no stored map, or one of a later version, or damaged.
     """
     tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if "map_settings" not in tables:
@@ -174,6 +174,9 @@ def read_settings(connection: sqlite3.Connection, path: Path) -> Settings:
     held: dict[str, Any] = {
         name: json.loads(value) for name, value in connection.execute("SELECT name, value FROM map_settings")
     }
+    missing = {"format", "crs", "srs_id", "proximity", "area"} - held.keys()
+    if missing:
+        raise InputError(f"{path} is damaged: map_settings has no {min(missing)}; restore it from a copy")
     if held["format"] > FORMAT:
         raise InputError(
             f"{path} was written by a later version of PolyMerge (format {held['format']}, this one knows {FORMAT}); "
