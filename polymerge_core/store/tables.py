@@ -166,7 +166,7 @@ def read_settings(connection: sqlite3.Connection, path: Path) -> Settings:
     Raises
     ------
     InputError
-        If the file is no stored map, or one of a later version.
+        If the file is no stored map, or one of a later version, or damaged.
     """
     tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if "map_settings" not in tables:
