@@ -256,7 +256,7 @@ def transform_coordinates(
 
 @lru_cache(maxsize=32)
 def transformer(source: pyproj.CRS, target: pyproj.CRS) -> pyproj.Transformer:
-    """Return what brings x and y, easting or longitude first, from one CRS to another; a stream asks again and again."""
+    """Return what brings x and y, easting or longitude first, from one CRS to another; kept, as a stream asks again."""
     return pyproj.Transformer.from_crs(source, target, always_xy=True)
 
 
