@@ -4,8 +4,9 @@
 
 The maps are made quickly: one block of a street, seen by three frames, is fed to a stored map as any frame is, and its
 rows are copied over a grid of blocks. Then frames come in at random blocks, at random places within them, so that each
-sees parts of up to four blocks. What is timed is all between a line of text and the answer: reading it, reading the
-neighbourhood, drawing and the commit; and once more without drawing. Maps stay in FOLDER and are not made again.
+sees parts of up to four blocks. What is timed, on the clock and of the processor (its median), is all between a line of
+text and the answer: reading it, reading the neighbourhood, drawing and the commit; and once more without drawing. Maps
+stay in FOLDER and are not made again.
 """
 
 from __future__ import annotations
@@ -158,8 +159,8 @@ def _move(
     geopackage.touched(connection, table, shapes)
 
 
-def measure(path: Path, blocks: int, frames: int, *, draw: bool) -> np.ndarray:
-    """Feed a map frames at random places; return the seconds that each took."""
+def measure(path: Path, blocks: int, frames: int, *, draw: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Feed a map frames at random places; return the seconds that each took, on the clock and of the processor."""
     rng = np.random.default_rng(2)
     store = MapStore(path)
     crs = store.crs
@@ -172,10 +173,11 @@ def measure(path: Path, blocks: int, frames: int, *, draw: bool) -> np.ndarray:
         text = frame(
             f"{'drawn' if draw else 'kept'}_{number}", centre, np.vstack([block_centre(row) for row in near]), rng
         )
-        start = time.perf_counter()
+        start = time.perf_counter(), time.process_time()
         store.update(read_message(text, crs, "frame").local_maps, draw=draw)
-        taken.append(time.perf_counter() - start)
-    return np.array(taken[3:])
+        taken.append((time.perf_counter() - start[0], time.process_time() - start[1]))
+    clock, processor = np.array(taken[3:]).T
+    return clock, processor
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -189,7 +191,7 @@ def main(arguments: list[str] | None = None) -> int:
     medians: dict[bool, list[float]] = {True: [], False: []}
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
-        print(f"{'elements':>9} {'file':>8} {'':>10} {'median':>8} {'99 %':>8} {'maximum':>8}")
+        print(f"{'elements':>9} {'file':>8} {'':>10} {'median':>9} {'99 %':>9} {'maximum':>9} {'processor':>9}")
         for size in map(int, options.sizes.split(",")):
             made = folder / f"map_{size}.gpkg"
             if not made.exists():
@@ -199,10 +201,11 @@ def main(arguments: list[str] | None = None) -> int:
             with contextlib.closing(sqlite3.connect(path)) as connection:
                 blocks = connection.execute("SELECT COUNT(*) FROM instances").fetchone()[0] // LOOKS
             for draw in (True, False):  # what is kept would be drawn with the next
-                taken = measure(path, blocks, options.frames, draw=draw)
+                taken, used = measure(path, blocks, options.frames, draw=draw)
                 medians[draw].append(float(np.median(taken)))
                 told = [
-                    f"{1000 * value:6.0f} ms" for value in (np.median(taken), np.quantile(taken, 0.99), taken.max())
+                    f"{1000 * value:6.0f} ms"
+                    for value in (np.median(taken), np.quantile(taken, 0.99), taken.max(), np.median(used))
                 ]
                 what = "drawn" if draw else "kept"
                 print(f"{size:>9} {path.stat().st_size / 1e6:5.0f} MB {what:>10} {' '.join(told)}", flush=True)

@@ -7,6 +7,7 @@ centred on the data. Plain metric coordinates without a place on Earth are decla
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -142,9 +143,9 @@ def scale_error(crs: pyproj.CRS, lon: NDArray[np.float64], lat: NDArray[np.float
     """
     step = 100.0
     try:
-        forward = pyproj.Transformer.from_crs(_LONLAT, crs, always_xy=True)
+        forward = transformer(_LONLAT, crs)
         x, y = forward.transform(lon, lat)
-        back = pyproj.Transformer.from_crs(crs, crs.geodetic_crs or _LONLAT, always_xy=True)
+        back = transformer(crs, crs.geodetic_crs or _LONLAT)
         here, east, north = (back.transform(x + dx, y + dy) for dx, dy in ((0, 0), (step, 0), (0, step)))
     except (ProjError, PyprojCrsError):
         return float("inf")
@@ -246,12 +247,17 @@ def transform_coordinates(
             "plain metric coordinates (crs=local) cannot be brought together with data that has a CRS; "
             "declare the CRS of every layer, or crs=local for all of them"
         )
-    transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
-    x, y = transformer.transform(coordinates[:, 0], coordinates[:, 1])
+    x, y = transformer(source, target).transform(coordinates[:, 0], coordinates[:, 1])
     moved = np.column_stack([x, y])
     if check and not np.isfinite(moved).all():
         raise CrsError(f"some coordinates in {source.name} have no place in {target.name}")
     return moved
+
+
+@lru_cache(maxsize=32)
+def transformer(source: pyproj.CRS, target: pyproj.CRS) -> pyproj.Transformer:
+    """Return what brings x and y, easting or longitude first, from one CRS to another; kept, as a stream asks again."""
+    return pyproj.Transformer.from_crs(source, target, always_xy=True)
 
 
 def _sample_lonlat(
@@ -260,8 +266,7 @@ def _sample_lonlat(
     """Return longitude and latitude of a 5 x 5 grid over the bounds, in degrees."""
     xmin, ymin, xmax, ymax = bounds
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(xmin, xmax, 5), np.linspace(ymin, ymax, 5)))
-    transformer = pyproj.Transformer.from_crs(crs, _LONLAT, always_xy=True)
-    lon, lat = transformer.transform(x, y)
+    lon, lat = transformer(crs, _LONLAT).transform(x, y)
     if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
         raise CrsError(
             f"{where}: coordinates from ({xmin:g}, {ymin:g}) to ({xmax:g}, {ymax:g}) have no place in {crs.name}; "

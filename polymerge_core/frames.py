@@ -20,7 +20,15 @@ import pyproj
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from polymerge_core.crs import SCALE_TOLERANCE, check_coordinates, is_local, is_metric, parse_crs, scale_error
+from polymerge_core.crs import (
+    SCALE_TOLERANCE,
+    check_coordinates,
+    is_local,
+    is_metric,
+    parse_crs,
+    scale_error,
+    transformer,
+)
 from polymerge_core.errors import CrsError, InputError, OptionError
 from polymerge_core.formats.records import LeftOutVector, Poses, Predictions
 from polymerge_core.formats.rotation import heading_to_matrix, is_rigid_motion, quaternion_to_matrix
@@ -344,8 +352,7 @@ def _check_positions(marked: Array, poses: Poses, pose_kind: str, target: pyproj
     check_coordinates(target, (low[0], low[1], high[0], high[1]), poses.source)
     if is_local(target) or pose_kind not in ("crs", "offset"):
         return
-    to_degrees = pyproj.Transformer.from_crs(target, _GEODETIC, always_xy=True)
-    error = scale_error(target, *to_degrees.transform(*marked[:, 0].T))
+    error = scale_error(target, *transformer(target, _GEODETIC).transform(*marked[:, 0].T))
     if error > MAX_SCALE_ERROR:
         raise CrsError(
             f"{poses.source}: a metre of {target.name} is {error:.0%} off a metre on the ground here, "

@@ -25,6 +25,7 @@ from polymerge_core.crs import (
     parse_crs,
     scale_error_over,
     transform_coordinates,
+    transformer,
     working_crs,
 )
 from polymerge_core.errors import CrsError, InputError
@@ -258,10 +259,7 @@ def _choose_crs(
     if not bounds or is_local(reference):
         return layer_crs, reference, reference
     boxes = np.array(
-        [
-            pyproj.Transformer.from_crs(layer_crs[number], reference, always_xy=True).transform_bounds(*box)
-            for number, box in bounds.items()
-        ]
+        [transformer(layer_crs[number], reference).transform_bounds(*box) for number, box in bounds.items()]
     )
     if not np.isfinite(boxes).all():
         raise CrsError(f"the layers lie so far apart that they cannot be brought together in {reference.name}")
@@ -314,8 +312,7 @@ def _check_out_crs(parts: pd.DataFrame, work: pyproj.CRS, out_crs: pyproj.CRS) -
     usable = parts.loc[parts["reason"].isna(), "shape"].to_numpy()
     if work == out_crs or len(usable) == 0:
         return
-    transformer = pyproj.Transformer.from_crs(work, out_crs, always_xy=True)
-    xmin, ymin, xmax, ymax = transformer.transform_bounds(*shapely.total_bounds(usable))
+    xmin, ymin, xmax, ymax = transformer(work, out_crs).transform_bounds(*shapely.total_bounds(usable))
     if not np.isfinite([xmin, ymin, xmax, ymax]).all():
         raise CrsError(f"the result has no place in {out_crs.name}; choose another out_crs")
     if xmin > xmax:

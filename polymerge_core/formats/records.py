@@ -128,6 +128,8 @@ class Poses:
 
     def _check_repeats(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Refuse two poses of one token or moment; the same pose given twice does no harm."""
+        if len(self.timestamp_ns) < 2:
+            return
         flat = {
             f"{name} {column}": values
             for name, value in arrays.items()
