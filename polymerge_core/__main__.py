@@ -415,7 +415,7 @@ def _region(source: str) -> gpd.GeoSeries:
     """Read the polygons of a file."""
     layers = list(pm.read_layers(source).values())
     if len(layers) > 1:
-        raise pm.InputError(f"{source} holds several layers; name the one of the region, \"FILE|layername=LAYER\"")
+        raise pm.InputError(f'{source} holds several layers; name the one of the region, "FILE|layername=LAYER"')
     return layers[0].geometry
 
 

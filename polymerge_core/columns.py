@@ -348,8 +348,8 @@ def _note_missing_class(features: pd.DataFrame, notes: dict[str, Any]) -> None:
         return
     without = ", ".join(repr(source) for source in sorted(unnamed["source"].unique()))
     notes["warnings"].append(
-        f"{without} has no class column, so its features are of class {unnamed['class'].iloc[0]!r}, which no other layer "
-        f"has (they have {', '.join(map(repr, sorted(others)))}); class_name names the class they are of"
+        f"{without} has no class column, so its features are of class {unnamed['class'].iloc[0]!r}, which no other "
+        f"layer has (they have {', '.join(map(repr, sorted(others)))}); class_name names the class they are of"
     )
 
 

@@ -580,7 +580,7 @@ def test_a_layer_without_a_class_column_is_of_the_one_class(without, cls):
 def test_no_class_in_common_for_want_of_a_class_column_is_refused(without):
     maps = [layer(level(0.5), cls="divider"), layer(level(0), cls="divider")]
     maps[without] = maps[without].drop(columns="class")
-    with pytest.raises(pm.SchemaError, match="has no class column, .*'divider'.*class_name"):
+    with pytest.raises(pm.SchemaError, match=r"has no class column, .*'divider'.*class_name"):
         judge(*maps)
 
 
