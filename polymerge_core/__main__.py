@@ -380,7 +380,10 @@ def verify(stored: Path) -> None:
 @click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True)
 @click.option("--overwrite", is_flag=True, help="Replace the outputs of an earlier run.")
 def run_demo(folder: Path, *, method: str, overwrite: bool) -> None:
-    """Merge the sample, a simulated drive through a town junction, into FOLDER (polymerge_demo) and draw it."""
+    """Merge the sample, a simulated drive through a town junction, into FOLDER and draw it.
+
+    Without FOLDER everything goes to the folder polymerge_demo, here.
+    """
     from polymerge_core import demo  # noqa: PLC0415 - matplotlib is slow to load, and only this command draws
 
     click.echo(demo.run_demo(folder, method=method, overwrite=overwrite))

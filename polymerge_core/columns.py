@@ -23,7 +23,7 @@ from polymerge_core.schema import ELEMENT_COLUMNS, LocalMaps, find_column
 NO_TIMESTAMP = np.iinfo(np.int64).max
 
 #: In the report: a source that does not say where its local maps looked.
-NO_FOOTPRINTS = "not known, so nothing is left out for want of support"
+NO_FOOTPRINTS = "not known, so nothing is left out for want of them"
 
 _POINT_TYPES = {"Point", "MultiPoint"}
 
