@@ -160,7 +160,7 @@ def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None
 @_output
 @_run_options
 def merge(local_maps: tuple[str, ...], output: Path, main_map: str | None, **chosen: Any) -> None:
-    """Merge local maps (FILE, or FILE|layername=LAYER) into one map."""
+    """Merge local maps (FILE, or "FILE|layername=LAYER" in quotes) into one map."""
     run = split_off(chosen)
     chosen["aggregate"] = _aggregate(chosen["aggregate"])
     Options.of(**chosen)  # a wrong value is told before anything is read
@@ -240,7 +240,7 @@ def evaluate(
     layers: Path | None,
     **chosen: Any,
 ) -> None:
-    """Measure how close the map MERGED (FILE, or FILE|layername=LAYER; repeatable) is to a reference."""
+    """Measure how close the map MERGED (FILE, or "FILE|layername=LAYER" in quotes; repeatable) is to a reference."""
     run = split_off(chosen)
     if output is not None and output.suffix.lower() not in {".html", ".htm"}:
         raise pm.OptionError(
@@ -302,7 +302,7 @@ def update(
     patience: float,
     **chosen: Any,
 ) -> None:
-    """Feed the stored map MAP local maps (FILE, or FILE|layername=LAYER), all of them or none."""
+    """Feed the stored map MAP local maps (FILE, or "FILE|layername=LAYER" in quotes), all of them or none."""
     run = split_off(chosen)
     if stream == bool(local_maps):
         raise click.UsageError("give local maps, or --stream to read them from standard input")
@@ -389,7 +389,10 @@ def verify(stored: Path) -> None:
 @click.option("--method", type=click.Choice(METHODS), default=METHODS[0], show_default=True)
 @click.option("--overwrite", is_flag=True, help="Replace the outputs of an earlier run.")
 def run_demo(folder: Path, *, method: str, overwrite: bool) -> None:
-    """Merge the sample, a simulated drive through a town junction, into FOLDER and draw it."""
+    """Merge the sample, a simulated drive through a town junction, into FOLDER and draw it.
+
+    Without FOLDER everything goes to the folder polymerge_demo, here.
+    """
     from polymerge_core import demo  # noqa: PLC0415 - matplotlib is slow to load, and only this command draws
 
     click.echo(demo.run_demo(folder, method=method, overwrite=overwrite))
@@ -424,7 +427,7 @@ def _region(source: str) -> gpd.GeoSeries:
     """Read the polygons of a file."""
     layers = list(pm.read_layers(source).values())
     if len(layers) > 1:
-        raise pm.InputError(f"{source} holds several layers; name the one of the region, FILE|layername=LAYER")
+        raise pm.InputError(f'{source} holds several layers; name the one of the region, "FILE|layername=LAYER"')
     return layers[0].geometry
 
 

@@ -22,6 +22,9 @@ from polymerge_core.schema import ELEMENT_COLUMNS, LocalMaps, find_column
 #: Order of an observation without a timestamp: after all that have one.
 NO_TIMESTAMP = np.iinfo(np.int64).max
 
+#: In the report: a source that does not say where its local maps looked.
+NO_FOOTPRINTS = "not known, so nothing is left out for want of them"
+
 _POINT_TYPES = {"Point", "MultiPoint"}
 
 
@@ -192,7 +195,7 @@ def _read_instance(
     if not layer.is_main:
         notes["instance_from"][layer.maps.source] = rule
         known = layer.maps.instances is not None
-        notes["footprints"][layer.maps.source] = "instances" if known else "hull of the observations"
+        notes["footprints"][layer.maps.source] = "instances" if known else NO_FOOTPRINTS
 
 
 def _read_score(find: _Finder, options: Options, table: pd.DataFrame) -> None:
@@ -338,14 +341,16 @@ def _note_classes_alike(classes: pd.Series, notes: dict[str, Any]) -> None:
 
 
 def _note_missing_class(features: pd.DataFrame, notes: dict[str, Any]) -> None:
-    named = features.groupby("source", sort=True)["has_class"].first()
-    if named.any() and not named.all():
-        without = ", ".join(repr(source) for source in named[~named].index)
-        default = features.loc[~features["has_class"], "class"].iloc[0]
-        notes["warnings"].append(
-            f"{without} has no class column, so its features are of class {default!r} and merge with no other class; "
-            "class_name names the class they are of"
-        )
+    has_class = features["has_class"].astype(bool)
+    named, unnamed = features[has_class], features[~has_class]
+    others = set(named.loc[named["reason"].isna(), "class"])
+    if unnamed.empty or not others or unnamed["class"].iloc[0] in others:
+        return
+    without = ", ".join(repr(source) for source in sorted(unnamed["source"].unique()))
+    notes["warnings"].append(
+        f"{without} has no class column, so its features are of class {unnamed['class'].iloc[0]!r}, which no other "
+        f"layer has (they have {', '.join(map(repr, sorted(others)))}); class_name names the class they are of"
+    )
 
 
 def _read_text(column: pd.Series | None, *, default: str) -> pd.Series | str:

@@ -89,9 +89,10 @@ class Curves:
         -------
         ndarray of float, shape (m, 2)
         """
-        # Looks that cancel each other out can leave a line without length.
-        length = np.maximum(self.length[line], np.finfo(float).tiny)
-        turns = np.where(self.closed[line], np.floor(position / length), 0.0)
+        length = self.length[line]
+        # Looks that cancel each other out can leave a line without length, around which there is no going.
+        around = self.closed[line] & (length > _SAME)
+        turns = np.floor(np.divide(position, length, out=np.zeros(len(line)), where=around))
         along = np.clip(position - turns * length, 0.0, length)
         laid = self._start[line] + along
         segment = np.searchsorted(self._laid, laid, side="right") - 1

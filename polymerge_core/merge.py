@@ -55,7 +55,8 @@ class MergeResult:
         Ids of main-map elements that became part of another one: `old_id`, `element_id`; -1 where all of the element is
         left out.
     report : dict
-        Counts, options, CRSs and warnings; ready for JSON.
+        Counts, options and CRSs, and under `warnings` a list of sentences on what may be wrong with the inputs, such as
+        features that nothing can be merged with; ready for JSON.
     """
 
     elements: gpd.GeoDataFrame
@@ -119,7 +120,7 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
     class_field : str, optional
         Column of the class, `class` by default. Only observations of one class are merged.
     class_name : str, default "line"
-        The class of everything where there is no class column.
+        The class of the features of a layer without a class column.
     drive_field, instance_field : str, optional
         Columns that tell which local map an observation belongs to, `drive` and `instance` by default.
     instance_from : {"column", "layer", "feature"}, optional
@@ -158,7 +159,8 @@ def merge(  # noqa: PLR0913 - each option by its name, as geopandas users know i
     Returns
     -------
     MergeResult
-        Elements, lineage, left-out, id aliases and report.
+        Elements, lineage, left-out, id aliases and report; read ``report["warnings"]``, which is printed by the command
+        line alone.
 
     Raises
     ------

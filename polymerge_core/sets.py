@@ -6,12 +6,14 @@ connected components, and in each the base polyline with the others breadth-firs
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 from typing import Any, TypeAlias
 
 import geopandas as gpd
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from polymerge_core.errors import SchemaError
@@ -205,11 +207,8 @@ def as_local_maps(layers: Any, name: str) -> list[LocalMaps]:
     """
     if isinstance(layers, (gpd.GeoDataFrame, gpd.GeoSeries, LocalMaps)):
         return [_as_one(layers, name)]
-    if isinstance(layers, (str, bytes)) or not isinstance(layers, Iterable):
-        raise SchemaError(
-            f"{name} cannot be {layers!r}; give a GeoDataFrame, LocalMaps, or a list of them "
-            "(read_local_maps reads them from files)"
-        )
+    if isinstance(layers, (str, bytes, Mapping, pd.DataFrame)) or not isinstance(layers, Iterable):
+        raise _not_a_layer(layers, name)
     return [_as_one(layer, f"{name}_{number}") for number, layer in enumerate(layers, start=1)]
 
 
@@ -221,4 +220,18 @@ def _as_one(layer: Any, name: str) -> LocalMaps:
         return LocalMaps(layer.to_frame("geometry"), source=name)
     if isinstance(layer, gpd.GeoDataFrame):
         return LocalMaps(layer, source=name)
-    raise SchemaError(f"{name} is a {type(layer).__name__}; give a GeoDataFrame, LocalMaps, or a list of them")
+    raise _not_a_layer(layer, name)
+
+
+def _not_a_layer(given: Any, name: str) -> SchemaError:
+    """Return the error for what is no layer, with what to give instead."""
+    advice = "give a GeoDataFrame, LocalMaps, or a list of them"
+    if hasattr(given, "as_main_map"):
+        advice = "give its .as_main_map() as main map, or its .elements as any other layer"
+    elif isinstance(given, Mapping):
+        advice = "give one of its layers, or a list of them"
+    elif isinstance(given, pd.DataFrame):
+        advice = "it has no geometry; give a GeoDataFrame"
+    elif isinstance(given, (str, bytes, PurePath)):
+        advice = "read it with read_local_maps"
+    return SchemaError(f"{name} is a {type(given).__name__}; {advice}")

@@ -114,7 +114,7 @@ def link_groups(instance: Index, size: Array, links: Links, unit: float) -> Inde
 def _costs(links: Links, unit: float) -> Array:
     """Return the mean square distance of groups as a share of the limit; infinite where there is none."""
     limit = unit**2 * (links.metres + (REACH**2 - 1) * links.covisible)
-    return np.where(limit > 0, links.square / np.maximum(limit, np.finfo(float).tiny), np.inf)
+    return np.divide(links.square, limit, out=np.full(len(limit), np.inf), where=limit > 0)
 
 
 def _apart(links: Links, seen: csr_array) -> NDArray[np.bool_]:

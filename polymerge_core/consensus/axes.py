@@ -224,7 +224,9 @@ class Axes:
             How well each station is known; 0 where nothing was seen.
         """
         known = weight[weight > 0]
-        relative = np.minimum(weight / np.median(known), _MOST) if len(known) else np.ones(len(weight))
+        usual = float(np.median(known)) if len(known) else 1.0
+        # Held down before it is divided: where most looks have a score of 0, the usual weight is next to nothing.
+        relative = np.minimum(weight, _MOST * usual) / usual if len(known) else np.ones(len(weight))
         # A ring goes on where it ends: it is smoothed with a piece of its own to either side.
         order, series, middle = self._unrolled()
         drawn = smooth(self.stations[order], relative[order], series, self._smoothing[series])[middle]

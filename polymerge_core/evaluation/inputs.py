@@ -98,6 +98,8 @@ def read_maps(merged: Input, reference: Input, local_maps: Input | None, region:
     )
     if reference_role.table.empty:
         raise InputError("the reference holds no line or polygon to compare with; give the layer of the true map")
+    without = [maps.source for (role, maps), each in zip(layers, plain, strict=True) if role != _LOCAL and _lacks(each)]
+    _check_common_class(merged_role, reference_role, without)
     footprints, footprint = _footprints([maps for _, maps in layers], local_role.table, observed)
     areas = None if region is None else _region(region, observed)
     local = None if local_maps is None else local_role
@@ -133,16 +135,32 @@ def _find(names: Sequence[Any], chosen: str | None, default: str, where: str) ->
     return named or find_column(names, default, named=False, where=where)
 
 
+def _lacks(maps: LocalMaps) -> bool:
+    """Whether features have no class column."""
+    return len(maps.observations) > 0 and "class" not in maps.observations
+
+
 def _check_class_field(layers: Sequence[LocalMaps], options: Options) -> None:
-    """Refuse a class column that a layer lacks: its lines would be compared with nothing."""
-    filled = [maps for maps in layers if len(maps.observations)]
-    without = [maps for maps in filled if "class" not in maps.observations]
-    if not without or (options.class_field is None and len(without) == len(filled)):
+    """Refuse a class column that the user named and a layer lacks."""
+    without = [maps.source for maps in layers if _lacks(maps)]
+    if options.class_field is None or not without:
         return
-    wanted = options.class_field or "class"
     raise SchemaError(
-        f"layer {without[0].source!r}: there is no column {wanted!r}, so its lines cannot be compared class by class; "
-        "name the column of the class (class_field), or rename it to class"
+        f"layer {without[0]!r}: there is no column {options.class_field!r}, so its lines cannot be compared class by "
+        "class; name the column of the class (class_field), or rename it to class"
+    )
+
+
+def _check_common_class(merged: Role, reference: Role, without: Sequence[str]) -> None:
+    """Refuse a map and a reference that have no class in common only because a layer names none."""
+    ours, true = set(merged.table["class"]), set(reference.table["class"])
+    if not without or not ours or ours & true:
+        return
+    listed = [", ".join(map(repr, sorted(classes))) for classes in (ours, true)]
+    raise SchemaError(
+        f"layer {without[0]!r} has no class column, and of the map's classes ({listed[0]}) the reference "
+        f"({listed[1]}) has none, so nothing can be compared; name the class that the layer is of (class_name), or the "
+        "column of the class (class_field)"
     )
 
 

@@ -68,7 +68,7 @@ def evaluate(  # noqa: PLR0913 - each option by its name, as in merge
     class_field, score_field : str, optional
         Columns of class and confidence, in the layers that have them; `class` and `score` by default.
     class_name : str, default "line"
-        The class of everything where no layer has a class column.
+        The class of the features of a layer without a class column.
     area : str or sequence of str, optional
         Classes that are areas, beside `ped_crossing`.
     crs : any, optional

@@ -360,6 +360,15 @@ def test_project_then_merge_the_sample(run, tmp_path, sample_folder):
     assert used == set(range(1, len(observations) + 1))
 
 
+def test_the_help_of_demo_names_the_folder_where_none_is_given(run):
+    assert "polymerge_demo" in run("demo", "--help").out
+
+
+@pytest.mark.parametrize("command", ["merge", "evaluate"])
+def test_a_layer_is_named_in_quotes_in_the_help(run, command):
+    assert '"FILE|layername=LAYER"' in run(command, "--help").out
+
+
 def test_demo_writes_maps_and_a_picture_once(run, tmp_path):
     folder = tmp_path / "new" / "demo"
     outcome = run("demo", folder)

@@ -108,6 +108,20 @@ def no_class(folder):
     return path
 
 
+def test_a_merge_and_a_reference_without_a_class_column_are_compared(run, tmp_path):
+    tracks = gpd.GeoDataFrame(
+        geometry=[LineString([(EAST, NORTH + y), (EAST + 90, NORTH + y)]) for y in (0, 1)], crs=UTM
+    )
+    tracks.to_file(tmp_path / "tracks.gpkg")
+    tracks.iloc[:1].to_file(tmp_path / "truth.gpkg")
+    assert run("merge", tmp_path / "tracks.gpkg", "--proximity", 15, "-o", tmp_path / "path.shp").code == 0
+    given = [tmp_path / "path.shp", "--reference", tmp_path / "truth.gpkg", "--local", tmp_path / "tracks.gpkg"]
+    done = run("evaluate", *given, "--json", "-")
+    assert done.code == 0
+    assert done.warnings == []
+    assert json.loads(done.out)["measures"]["line"]["frechet_best"]["value"] == pytest.approx(0.5, abs=1e-3)
+
+
 def points(folder):
     path = folder / "points.gpkg"
     gpd.GeoDataFrame({"class": ["divider"]}, geometry=[Point(EAST, NORTH)], crs=UTM).to_file(path)

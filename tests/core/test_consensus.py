@@ -9,14 +9,14 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely import LineString, Polygon, box
+from shapely import LineString, Point, Polygon, box
 from shapely.ops import substring
 
 import polymerge_core as pm
 from benchmarks.scenarios import town
 from polymerge_core.consensus.alongside import pairs_alongside
 from polymerge_core.consensus.association import associate
-from polymerge_core.consensus.axes import smooth
+from polymerge_core.consensus.axes import Axes, smooth
 from polymerge_core.consensus.drift import estimate_drift
 from polymerge_core.consensus.looks import Instances, Looks
 
@@ -450,7 +450,24 @@ def test_smoothing_bridges_what_has_no_weight():
     )
 
 
+@pytest.mark.filterwarnings("error")
+def test_weights_next_to_nothing_are_weights():
+    stations = level(0, 0, 8, 1)
+    stations[6, 1] = 1.0
+    weight = np.where(np.arange(9) < 6, np.finfo(float).tiny, 30.0)
+    smoothed = Axes(stations, np.zeros(9, dtype=np.intp)).smoothed(weight).stations
+    assert np.isfinite(smoothed).all()
+    assert 0 < smoothed[6, 1] < 1
+
+
 # Bad and odd input
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("score", [0.0, 1.0])
+def test_rings_far_smaller_than_the_proximity_are_merged_without_a_warning(score):
+    rings = [Point(0, 0).buffer(radius, 2).exterior.coords for radius in (1, 3)]
+    assert len(merge(looks(*rings, score=[score] * 2), proximity=10.0).elements) > 0
 
 
 def test_a_proximity_too_small_for_the_data_is_refused():

@@ -29,6 +29,12 @@ def test_what_lies_beyond_an_end_falls_exactly_onto_it():
         assert curves.locate(every, ends).tolist() == position.tolist()
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_line_without_length_is_one_place():
+    curves = Curves(shapely.linestrings([[(3, 4), (3, 4)], [(0, 0), (9, 0)]]))
+    assert curves.points_at(np.array([0, 0, 1]), np.array([7.0, -7.0, 5.0])).tolist() == [[3, 4], [3, 4], [5, 0]]
+
+
 def test_distinct_values_rise():
     assert distinct(np.array([3, 1, 3, 2, 1])).tolist() == [1, 2, 3]
     assert distinct(np.array([], dtype=np.intp)).tolist() == []

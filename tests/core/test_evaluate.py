@@ -558,15 +558,42 @@ def test_the_class_may_stand_in_another_column():
     assert judge(merged, reference, class_field="kind").value("kerb", "frechet_best") == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("options", [{"class_field": "kind"}, {}], ids=["named", "in one layer only"])
-def test_a_class_column_that_is_not_there_is_refused(options):
-    merged = layer(level(0)).drop(columns="class")
-    reference = merged if options else layer(level(0))
-    with pytest.raises(pm.SchemaError, match="kind" if options else "class"):
-        judge(merged, reference, **options)
+def test_a_class_column_that_was_named_must_be_there():
+    plain = layer(level(0)).drop(columns="class")
+    with pytest.raises(pm.SchemaError, match="kind"):
+        judge(plain, plain, class_field="kind")
 
 
-@pytest.mark.parametrize("wrong", [None, 3, "truth.gpkg", pd.DataFrame({"class": ["line"]})], ids=str)
+@pytest.mark.parametrize("cls", ["line", "kerb"])
+@pytest.mark.parametrize("without", ["merged", "reference", "local_maps"])
+def test_a_layer_without_a_class_column_is_of_the_one_class(without, cls):
+    maps = {"merged": layer(level(0.5), cls=cls), "reference": layer(level(0), cls=cls)}
+    maps["local_maps"] = layer(level(0.7), cls=cls)
+    maps[without] = maps[without].drop(columns="class")
+    result = judge(**maps, class_name=cls)
+    assert result.value(cls, "frechet_best") == pytest.approx(0.5)
+    assert result.value(cls, "frechet_before") == pytest.approx(0.7)
+    assert result.report["warnings"] == []
+
+
+@pytest.mark.parametrize("without", [0, 1], ids=["the map", "the reference"])
+def test_no_class_in_common_for_want_of_a_class_column_is_refused(without):
+    maps = [layer(level(0.5), cls="divider"), layer(level(0), cls="divider")]
+    maps[without] = maps[without].drop(columns="class")
+    with pytest.raises(pm.SchemaError, match=r"has no class column, .*'divider'.*class_name"):
+        judge(*maps)
+
+
+def test_observations_without_a_class_column_beside_other_classes_are_told():
+    classed, plain = layer(level(0), cls="divider"), layer(level(0.5)).drop(columns="class")
+    (warning,) = judge(classed, classed, local_maps=plain, region_from="all").report["warnings"]
+    assert "'local_maps' has no class column" in warning
+    assert "'divider'" in warning
+
+
+@pytest.mark.parametrize(
+    "wrong", [None, 3, "truth.gpkg", {"truth": layer(level(0))}, pd.DataFrame({"class": ["line"]})], ids=type
+)
 def test_what_is_no_layer_is_refused(wrong):
     with pytest.raises(pm.PolymergeError):
         judge(layer(level(0)), wrong)

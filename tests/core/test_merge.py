@@ -14,6 +14,7 @@ from shapely import LineString, MultiLineString, Point, Polygon
 
 from polymerge_core import InputError, LocalMaps, OptionError, SchemaError, merge
 from polymerge_core.area import merge_areas
+from polymerge_core.columns import NO_FOOTPRINTS
 from polymerge_core.crs import LOCAL_CRS
 from tests.core.methods import consensus, every_method, published
 
@@ -762,7 +763,7 @@ class TestReport:
             "working_crs": "local",
             "out_crs": "local",
             "instance_from": {"local_maps": "column"},
-            "footprints": {"local_maps": "hull of the observations"},
+            "footprints": {"local_maps": NO_FOOTPRINTS},
             "observations": 2,
             "main_map_elements": 1,
             "instances": 2,

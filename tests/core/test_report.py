@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import geopandas as gpd
+import pandas as pd
 import pytest
 from shapely import LineString, box
 
@@ -15,6 +18,7 @@ from polymerge_core import (
     read_local_maps,
     write_layers,
 )
+from polymerge_core.columns import NO_FOOTPRINTS
 from tests.core.methods import every_method, published
 
 pytestmark = every_method
@@ -54,7 +58,34 @@ class TestLayersThatCountAsOneLocalMap:
 def test_a_layer_without_the_class_column_that_others_have_is_told():
     (warning,) = warnings_of(layer(line(0)), layer(line(0.5), element_id=[3], **{"class": ["divider"]}))
     assert "'local_maps' has no class column" in warning
+    assert "'divider'" in warning
     assert "class_name" in warning
+
+
+def test_a_layer_without_a_class_column_whose_class_others_have_is_fine():
+    main = layer(line(0.5), line(90), element_id=[3, 4], **{"class": ["line", "divider"]})
+    result = merge(layer(line(0)), main)
+    assert result.report["warnings"] == []
+    assert sorted(result.elements["n_observations"]) == [1, 2]
+
+
+class TestWhatIsNoLayer:
+    @pytest.mark.parametrize(
+        ("given", "words"),
+        [
+            pytest.param(merge(layer(line(0))), r"is a MergeResult; .*\.as_main_map\(\).*\.elements", id="a result"),
+            pytest.param({"tracks": layer(line(0))}, "is a dict; give one of its layers", id="a dictionary"),
+            pytest.param(pd.DataFrame({"score": [1.0]}), "is a DataFrame; it has no geometry", id="a table"),
+            pytest.param("tracks.gpkg", "is a str; read it with read_local_maps", id="a name"),
+            pytest.param(Path("tracks.gpkg"), "; read it with read_local_maps", id="a path"),
+            pytest.param(None, "give a GeoDataFrame", id="nothing"),
+        ],
+    )
+    def test_is_refused_with_what_to_give(self, given, words):
+        for arguments in ((given,), ([given],), (layer(line(0)), [given])):
+            with pytest.raises(SchemaError, match=words) as found:
+                merge(*arguments)
+            assert len(str(found.value)) < 120
 
 
 @published
@@ -168,5 +199,5 @@ def test_where_footprints_come_from_is_said():
     looks = layer(line(0), instance=[1])
     footprints = layer(box(0, 0, 9, 9), drive=["a"], instance=[1])
     sources = [LocalMaps(looks, footprints, source="a"), LocalMaps(looks, source="b")]
-    expected = {"a": "instances", "b": "hull of the observations"}
+    expected = {"a": "instances", "b": NO_FOOTPRINTS}
     assert merge(sources).report["footprints"] == expected
