@@ -34,7 +34,7 @@ def drive(number, *lines, frames=6, footprints=True, sigma=0.1, cls="divider"):
             by = shift + rng.normal(0, sigma, 2)
             seen = shapely.transform(line, lambda xy, by=by: xy + by)
             rows.append({**name, "class": cls, "score": 0.9, "timestamp": time, "geometry": seen})
-        area = box(*(ORIGIN - [10, 20]), *(ORIGIN + [70, 20]))
+        area = shapely.transform(box(-10, -20, 70, 20), lambda xy: xy + ORIGIN)
         looked.append(
             {**name, "timestamp_ns": time, "x": ORIGIN[0] + 30, "y": ORIGIN[1], "heading": 90.0, "geometry": area}
         )
