@@ -256,7 +256,7 @@ class TestStream:
         answers = []
         frames = [json.dumps(message(n)) for n in range(5)]
         total = run_stream(Watched(city), frames, answers.append, draw_every=2)
-        # Where the reader is slower than the map there are more drawings than after the second, the fourth and the last.
+        # Where the reader is slower than the map there are more drawings than after two, four and five.
         assert max(np.diff([0, *drawn])) <= 2
         assert drawn[-1] == 5
         assert total["instances"] == 5

@@ -776,10 +776,17 @@ class TestOtherPrograms:
             check_names=False,
         )
 
-    def test_may_merge_into_it(self, told, drive):
-        again = pm.merge(some(drive, np.arange(3)), pm.read_local_maps([f"{told[0].path}|layername=elements"]))
+    @pytest.mark.parametrize("named", ["", "|layername=elements"])
+    def test_may_merge_into_it_and_ids_stay(self, told, drive, named):
+        store, _ = told
+        (main,) = pm.read_local_maps([f"{store.path}{named}"])
+        assert main.observations["element_id"].tolist() == store.elements()["element_id"].tolist()
+        again = pm.merge(some(drive, np.arange(3)), main)
         there = {*again.elements["element_id"], *again.id_aliases["old_id"]}
-        assert set(told[0].elements()["element_id"]) <= there
+        assert set(store.elements()["element_id"]) <= there
+        # None of those that are no more is given again.
+        new = set(again.elements["element_id"]) - set(store.elements()["element_id"])
+        assert min(new, default=10**9) > max(store.elements()["element_id"])
 
     def test_may_append_and_the_spatial_index_follows(self, fed):
         more = gpd.read_file(fed.path, layer="elements").iloc[:1].to_crs(fed.crs)
