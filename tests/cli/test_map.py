@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import os
 import shutil
 import sqlite3
 
@@ -15,6 +14,7 @@ import pytest
 import shapely
 
 import polymerge_core as pm
+from polymerge_core.store.geopackage import connect
 from polymerge_core.streaming import run_stream
 from tests.cli.layers import EAST, NORTH, UTM, draw, line, look
 
@@ -256,8 +256,8 @@ class TestStream:
         answers = []
         frames = [json.dumps(message(n)) for n in range(5)]
         total = run_stream(Watched(city), frames, answers.append, draw_every=2)
-        # Where the reader is slower than the map there are more drawings than these.
-        assert {2, 4} <= {*drawn, *range(2, 5)}
+        # Where the reader is slower than the map there are more drawings than after two, four and five.
+        assert max(np.diff([0, *drawn])) <= 2
         assert drawn[-1] == 5
         assert total["instances"] == 5
         assert total["elements"] == 2
@@ -317,10 +317,7 @@ class TestHistory:
         printed = json.loads(run("history", made, "--json", "-").out)
         assert printed == json.loads((tmp_path / "history.json").read_text())
         assert [row["added"] for row in printed["revisions"]] == [2, 0]
-        assert (
-            "polymerge" in printed["revisions"][0]["software"].lower()
-            or "shapely" in printed["revisions"][0]["software"]
-        )
+        assert "shapely" in printed["revisions"][0]["software"]
 
 
 class TestChanges:
@@ -472,9 +469,9 @@ class TestBadFiles:
         assert not out.exists()
         assert (path.read_bytes() if path.is_file() else None) == before
 
-    @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anything")
-    def test_that_cannot_be_written(self, run, city, files):
-        city.chmod(0o444)
+    def test_that_cannot_be_written(self, run, city, files, monkeypatch):
+        # As of a file without permission, which root has all the same.
+        monkeypatch.setattr("polymerge_core.store.map_store.connect", lambda path, _mode: connect(path, "ro"))
         outcome = run("update", city, files[2])
         assert outcome.code == 1
         (error,) = outcome.errors
