@@ -24,9 +24,6 @@ from polymerge_core.io.sources import Source
 
 _COLLECTION = 7  # shapely's type id; curves have higher ones
 
-#: The column that an element goes by.
-_ID = "element_id"
-
 
 class LayerInfo(NamedTuple):
     """What a file says about one of its layers.
@@ -97,9 +94,6 @@ def read_layer(source: Source, layer: LayerInfo) -> gpd.GeoDataFrame:
                     f"{source.file}: layer {layer.name} is cut short ({len(frame)} of {layer.features} features are "
                     "there); copy the file again"
                 )
-            if layer.id_column == _ID and _ID not in frame:
-                # A stored map numbers its elements with the feature ids themselves.
-                frame.insert(0, _ID, frame.index.to_numpy())
         return _declare_crs(_plain_types(frame), source.file)
 
 

@@ -423,7 +423,7 @@ class Redraw:
             held = now[chosen]
             blobs = geopackage.to_blobs(held.geometry.to_numpy(), self.settings.srs_id)
             attributes = {name: held[name] for name in ELEMENT}
-            write(self.connection, "elements", {"element_id": held.index, "geom": blobs, **attributes})
+            write(self.connection, "elements", {"fid": held.index, "element_id": held.index, "geom": blobs, **attributes})
         written = now[changed]
         kind = np.where(new[changed], "added", "changed").astype(object)
         by = np.zeros(len(written))

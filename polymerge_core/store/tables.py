@@ -37,7 +37,8 @@ ELEMENT = {
 _INTERVAL = {"source": "TEXT", "source_fid": "TEXT", "drive": "TEXT", "instance": "TEXT"}
 
 _LAYERS = {
-    "elements": ("element_id", ELEMENT, "GEOMETRY"),
+    # The feature id is the element's, too, which readers that hide feature ids would lose.
+    "elements": ("fid", {"element_id": "INTEGER", **ELEMENT}, "GEOMETRY"),
     "changes": (
         "fid",
         {"revision": "INTEGER", "element_id": "INTEGER", "kind": "TEXT", "moved_m": "REAL", **ELEMENT},
@@ -123,6 +124,7 @@ _INDEXES = (
     ("instances", "drive, instance", True),
     ("instances", "drawn", False),
     ("observations", "instance_fid", False),
+    ("elements", "element_id", True),
     ("lineage", "element_id", False),
     ("lineage", "observation_fid", False),
     ("left_out", "observation_fid", False),

@@ -24,6 +24,7 @@ _QUESTIONS = {
     "elements have no lineage": (
         "SELECT element_id FROM elements WHERE element_id NOT IN (SELECT element_id FROM lineage)"
     ),
+    "elements have another feature id than their own": "SELECT element_id FROM elements WHERE fid IS NOT element_id",
     "lineage names observations that are not there": (
         "SELECT DISTINCT observation_fid FROM lineage WHERE observation_fid NOT IN (SELECT fid FROM observations)"
     ),
@@ -116,8 +117,7 @@ def _intervals(connection: sqlite3.Connection) -> list[str]:
 
 def _layer(connection: sqlite3.Connection, layer: str) -> list[str]:
     """Check geometries, the spatial index and the bounds of a layer."""
-    key = "element_id" if layer == "elements" else "fid"
-    rows = connection.execute(f'SELECT "{key}", geom FROM "{layer}" WHERE geom IS NOT NULL ORDER BY "{key}"').fetchall()
+    rows = connection.execute(f'SELECT fid, geom FROM "{layer}" WHERE geom IS NOT NULL ORDER BY fid').fetchall()
     ids = np.array([row[0] for row in rows], dtype=np.float64)
     shapes = geopackage.from_blobs([row[1] for row in rows])
     found = []
