@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import shutil
 import sqlite3
 import sys
@@ -32,7 +33,7 @@ from polymerge_core.store.geopackage import connect
 
 CRS = "EPSG:32632"
 CENTRE = np.array([400_000.0, 5_600_000.0])
-#: A block is as large as what a frame looks at, metres; the grid has so many blocks in a row.
+#: A block is as large as what a frame looks at, metres; the grid has at most so many blocks in a row.
 BLOCK_M, COLUMNS = np.array([60.0, 30.0]), 200
 LOOKS = 3
 #: What an update may take at the largest size, seconds, and how much longer than at the smallest.
@@ -74,9 +75,14 @@ def frame(name: str, centre: np.ndarray, blocks: np.ndarray, rng: np.random.Gene
     return json.dumps(message | {"footprint": footprint, "vectors": vectors, "labels": labels})
 
 
-def block_centre(number: int) -> np.ndarray:
+def columns_of(blocks: int) -> int:
+    """Return how many blocks a row of the grid has."""
+    return min(COLUMNS, math.isqrt(blocks))
+
+
+def block_centre(number: int, columns: int) -> np.ndarray:
     """Return where a block lies."""
-    return CENTRE + BLOCK_M * [number % COLUMNS, number // COLUMNS]
+    return CENTRE + BLOCK_M * [number % columns, number // columns]
 
 
 def make_map(path: Path, elements: int) -> int:
@@ -84,7 +90,7 @@ def make_map(path: Path, elements: int) -> int:
     rng = np.random.default_rng(1)
     store = MapStore(path, create=True, crs=CRS)
     for look in range(LOOKS):
-        text = frame(f"block_0_{look}", block_centre(0), block_centre(0)[None], rng)
+        text = frame(f"block_0_{look}", CENTRE, CENTRE[None], rng)
         store.update(read_message(text, store.crs, "frame").local_maps)
     blocks = -(-elements // len(store.elements()))
     with contextlib.closing(connect(path, _PATIENCE_S)) as connection:
@@ -131,7 +137,8 @@ def _copy(connection: sqlite3.Connection, table: str, blocks: int, steps: dict[s
             for row, number in zip(copies, np.repeat(numbers, len(held)).tolist(), strict=True):
                 row[drive] = row[drive].replace("_0_", f"_{number}_")
         if table in _LAYERS and held:
-            _move(connection, table, numbers, copies, (names.index(key), names.index("geom")))
+            far = np.vstack([block_centre(number, columns_of(blocks)) for number in numbers]) - CENTRE
+            _move(connection, table, far, copies, (names.index(key), names.index("geom")))
         connection.executemany(f'INSERT INTO "{table}" VALUES ({marks})', copies)
     connection.execute(
         "UPDATE gpkg_ogr_contents SET feature_count = feature_count * ? WHERE table_name = ?", (blocks, table)
@@ -139,13 +146,12 @@ def _copy(connection: sqlite3.Connection, table: str, blocks: int, steps: dict[s
 
 
 def _move(
-    connection: sqlite3.Connection, table: str, numbers: np.ndarray, copies: list[list[Any]], at: tuple[int, int]
+    connection: sqlite3.Connection, table: str, far: np.ndarray, copies: list[list[Any]], at: tuple[int, int]
 ) -> None:
     """Move the geometries of copies to their blocks, and put them into the spatial index and the bounds."""
     key, geom = at
     shapes = geopackage.from_blobs([row[geom] for row in copies])
-    far = np.vstack([block_centre(number) for number in numbers]) - block_centre(0)
-    each = np.repeat(far, len(copies) // len(numbers), axis=0)
+    each = np.repeat(far, len(copies) // len(far), axis=0)
     shift = np.repeat(each, shapely.get_num_coordinates(shapes), axis=0)
     shapely.set_coordinates(shapes, shapely.get_coordinates(shapes) + shift)
     (srs_id,) = connection.execute("SELECT srs_id FROM gpkg_contents WHERE table_name = ?", (table,)).fetchone()
@@ -163,16 +169,16 @@ def measure(path: Path, blocks: int, frames: int, *, draw: bool) -> tuple[np.nda
     """Feed a map frames at random places; return the seconds that each took, on the clock and of the processor."""
     rng = np.random.default_rng(2)
     store = MapStore(path)
-    crs = store.crs
+    crs, columns = store.crs, columns_of(blocks)
     taken = []
     for number in range(-3, frames):  # three to warm up
-        block = int(rng.integers(blocks))
-        centre = np.round(block_centre(block) + rng.uniform(-10, 10, 2), 2)
-        rows = [block + right + COLUMNS * up for right in (-1, 0, 1) for up in (-1, 0, 1)]
-        near = [row for row in rows if 0 <= row < blocks and abs(row % COLUMNS - block % COLUMNS) <= 1]
-        text = frame(
-            f"{'drawn' if draw else 'kept'}_{number}", centre, np.vstack([block_centre(row) for row in near]), rng
-        )
+        # With all its neighbours, as most have them in a large map.
+        column, row = rng.integers(1, columns - 1), rng.integers(1, blocks // columns - 1)
+        block = int(column + columns * row)
+        near = [block + right + columns * up for right in (-1, 0, 1) for up in (-1, 0, 1)]
+        centre = np.round(block_centre(block, columns) + rng.uniform(-10, 10, 2), 2)
+        name = f"{'drawn' if draw else 'kept'}_{number}"
+        text = frame(name, centre, np.vstack([block_centre(each, columns) for each in near]), rng)
         start = time.perf_counter(), time.process_time()
         store.update(read_message(text, crs, "frame").local_maps, draw=draw)
         taken.append((time.perf_counter() - start[0], time.process_time() - start[1]))
