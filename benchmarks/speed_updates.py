@@ -42,7 +42,7 @@ LIMIT_S, GROWTH = 0.1, 1.5
 _NOISE_M, _STEP_M = 0.1, 5.0
 _PATIENCE_S = 10.0
 _AT_ONCE = 500
-_KEYS = {"elements": "element_id"}
+_KEYS: dict[str, str] = {}
 _LAYERS = ("instances", "observations", "elements", "changes")
 _TABLES = (*_LAYERS, "lineage", "left_out")
 #: Columns that name a row of another table.

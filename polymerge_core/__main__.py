@@ -308,7 +308,7 @@ def update(
         raise click.UsageError("give local maps, or --stream to read them from standard input")
     if stream and run["watch_stdin"]:
         raise click.UsageError("--watch-stdin does not go with --stream, which reads standard input")
-    made = crs if create and not stored.exists() else None
+    made = crs if create else None
     with Job(None, local_maps, [], **run) as job:
         held = pm.MapStore(stored, create=create, crs=made, proximity=proximity, area=area, patience_s=patience)
         if stream:

@@ -112,8 +112,11 @@ def _told(path: Path, patience_s: float, *, writing: bool = False) -> Iterator[N
         yield
     except sqlite3.Error as error:
         raise kind(_explained(path, str(error), patience_s, writing=writing) + whole) from error
+    except UnicodeDecodeError as error:
+        raise kind(f"{path} is damaged: it holds text that is none; restore it from a copy{whole}") from error
     except OSError as error:
-        raise kind(f"{path} cannot be opened: {error.strerror or error}{whole}") from error
+        why = error.strerror or error
+        raise kind(f"{path} cannot be opened; check the folder and its permissions ({why}){whole}") from error
 
 
 def _explained(path: Path, message: str, patience_s: float, *, writing: bool) -> str:

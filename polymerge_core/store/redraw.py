@@ -34,6 +34,9 @@ from polymerge_core.store.tables import ELEMENT, Settings
 #: Why a piece of an observation is in no element.
 RENEWED = "the road changed since"
 
+#: Why all of an observation is in no element: its local map is one of too many.
+UNHEARD = "enough other local maps looked there"
+
 #: From so many drives on the last two may be too few to be heard at once.
 _MANY = 4
 
@@ -133,7 +136,19 @@ class Redraw:
         lost = now.index[now["n_observations"] == 0]
         gone |= {int(own): NO_ELEMENT for own in lost if own in was.index}
         self._write(now.drop(lost), was, gone)
+        self._list_unheard()
         return self.counts
+
+    def _list_unheard(self) -> None:
+        """List what is new and was not heard, because enough others looked there."""
+        self.connection.execute(
+            "INSERT INTO left_out (source, source_fid, drive, instance, from_m, to_m, reason, observation_fid) "
+            "SELECT o.source, o.source_fid, i.drive, i.instance, o.from_m, o.to_m, ?, o.fid FROM instances i JOIN "
+            "observations o ON o.instance_fid = i.fid WHERE i.drawn IS NULL AND o.fid NOT IN (SELECT observation_fid "
+            "FROM lineage WHERE observation_fid = o.fid) AND o.fid NOT IN (SELECT observation_fid FROM left_out WHERE "
+            "observation_fid = o.fid) ORDER BY o.fid",
+            (UNHEARD,),
+        )
 
     def _stored(self) -> gpd.GeoDataFrame:
         """Return the elements that meet the place, by their id."""
@@ -222,6 +237,9 @@ class Redraw:
         if len(first) < _MANY or maps.instances is None:
             return nothing
         late = context.instances.index[drive >= len(first) - 2]
+        unsupported = merged.left_out.loc[merged.left_out["reason"] == UNSUPPORTED, "observation_fid"]
+        if not context.observations["instance_fid"].reindex(unsupported).isin(late).any():
+            return nothing
         whose = context.observations["instance_fid"].reindex(merged.pieces.observation)
         rows = np.flatnonzero(whose.isin(late))
         theirs = replace(
@@ -423,7 +441,9 @@ class Redraw:
             held = now[chosen]
             blobs = geopackage.to_blobs(held.geometry.to_numpy(), self.settings.srs_id)
             attributes = {name: held[name] for name in ELEMENT}
-            write(self.connection, "elements", {"fid": held.index, "element_id": held.index, "geom": blobs, **attributes})
+            write(
+                self.connection, "elements", {"fid": held.index, "element_id": held.index, "geom": blobs, **attributes}
+            )
         written = now[changed]
         kind = np.where(new[changed], "added", "changed").astype(object)
         by = np.zeros(len(written))

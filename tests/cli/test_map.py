@@ -17,6 +17,7 @@ import polymerge_core as pm
 from polymerge_core.store.geopackage import connect
 from polymerge_core.streaming import run_stream
 from tests.cli.layers import EAST, NORTH, UTM, draw, line, look
+from tests.core.layers import read_only
 
 CRS = ("--crs", UTM)
 
@@ -471,7 +472,7 @@ class TestBadFiles:
 
     def test_that_cannot_be_written(self, run, city, files, monkeypatch):
         # As of a file without permission, which root has all the same.
-        monkeypatch.setattr("polymerge_core.store.map_store.connect", lambda path, _mode: connect(path, "ro"))
+        monkeypatch.setattr("polymerge_core.store.map_file.connect", read_only)
         outcome = run("update", city, files[2])
         assert outcome.code == 1
         (error,) = outcome.errors
@@ -489,13 +490,13 @@ class TestBadFiles:
         assert "check the folder" in error
 
     def test_that_another_program_writes(self, run, city, files, monkeypatch):
-        monkeypatch.setattr("polymerge_core.store.geopackage.PATIENCE_S", 0.01)
+        monkeypatch.setattr("polymerge_core.store.map_file.connect", lambda path, _patience: connect(path, 0.01))
         with contextlib.closing(sqlite3.connect(city, isolation_level=None)) as other:
             other.execute("BEGIN IMMEDIATE")
             outcome = run("update", city, files[2])
         assert outcome.code == 1
         (error,) = outcome.errors
-        assert "in use by another program" in error
+        assert "locked by another program" in error
         assert pm.MapStore(city).verify() == []
 
 

@@ -253,7 +253,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     folder = tmp_path / "disk"
     folder.mkdir()
     mount = shutil.which("mount")
-    options = ["-t", "tmpfs", "-o", "size=320k"]
+    options = ["-t", "tmpfs", "-o", "size=400k"]
     if mount is None or subprocess.run([mount, *options, "none", folder], capture_output=True, check=False).returncode:
         pytest.skip("only root can make a disk")
     yield folder
@@ -471,7 +471,7 @@ NO_MAPS = {
         lambda path: path.unlink() or draw(path, [line((0, 0), (9, 0))]),
         ["map.gpkg is no stored map", "--create", "--main-map"],
     ),
-    "a folder": (a_folder, ["map.gpkg cannot be opened"]),
+    "a folder": (a_folder, ["map.gpkg is a folder"]),
     "nothing": (lambda path: path.unlink(), ["map.gpkg does not exist", "--create"]),
     "an empty file": (lambda path: path.write_bytes(b""), ["map.gpkg does not exist", "--create"]),
     "a link to nothing": (

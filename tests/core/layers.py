@@ -7,6 +7,7 @@ import geopandas as gpd
 import numpy as np
 
 from polymerge_core.io import read_layers
+from polymerge_core.store.geopackage import connect
 
 UTM = "EPSG:25833"
 EXTENSIONS = ["gpkg", "shp", "geojson", "fgb", "parquet"]
@@ -36,3 +37,10 @@ def digest(path):
 
 def temporaries(folder):
     return [entry.name for entry in Path(folder).iterdir() if entry.name.startswith(".polymerge-")]
+
+
+def read_only(path, patience_s):
+    """Open a GeoPackage that cannot be written: as without permission, which root has all the same."""
+    connection = connect(path, patience_s)
+    connection.execute("PRAGMA query_only = ON")
+    return connection

@@ -25,6 +25,7 @@ from polymerge_core.crs import LOCAL_CRS
 from polymerge_core.store import redraw
 from polymerge_core.store.geopackage import connect
 from polymerge_core.store.map_store import displacement
+from tests.core.layers import read_only
 from tests.core.test_consensus import apart, level, looks
 from tests.core.test_consensus_state import distances, some
 
@@ -728,10 +729,10 @@ class TestFailing:
 
     def test_says_so_where_another_program_writes(self, store, monkeypatch):
         store.update(frame(0, level(0, 0, 100)))
-        monkeypatch.setattr("polymerge_core.store.geopackage.PATIENCE_S", 0.01)
+        monkeypatch.setattr("polymerge_core.store.map_file.connect", lambda path, _patience: connect(path, 0.01))
         with contextlib.closing(sqlite3.connect(store.path, isolation_level=None)) as other:
             other.execute("BEGIN IMMEDIATE")
-            with pytest.raises(pm.OutputError, match=r"in use by another program.*as it was"):
+            with pytest.raises(pm.OutputError, match=r"locked by another program.*as it was"):
                 store.update(frame(1, level(0, 0, 100)))
             # Reading goes on.
             assert len(store.elements()) == 1
@@ -739,7 +740,7 @@ class TestFailing:
     def test_says_so_where_the_file_cannot_be_written(self, store, monkeypatch):
         store.update(frame(0, level(0, 0, 100)))
         # As of a file without permission, which root has all the same.
-        monkeypatch.setattr("polymerge_core.store.map_store.connect", lambda path, _mode: connect(path, "ro"))
+        monkeypatch.setattr("polymerge_core.store.map_file.connect", read_only)
         with pytest.raises(pm.OutputError, match="cannot be written"):
             store.update(frame(1, level(0, 0, 100)))
 
@@ -790,7 +791,7 @@ class TestOtherPrograms:
 
     def test_may_append_and_the_spatial_index_follows(self, fed):
         more = gpd.read_file(fed.path, layer="elements").iloc[:1].to_crs(fed.crs)
-        more = more.set_geometry(more.geometry.translate(900, 0))
+        more = more.set_geometry(more.geometry.translate(900, 0)).assign(element_id=9999)
         pyogrio.write_dataframe(more, fed.path, layer="elements", append=True)
         found = fed.verify()
         assert found
