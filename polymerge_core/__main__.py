@@ -20,6 +20,7 @@ from polymerge_core.evaluation import REGION_FROM
 from polymerge_core.formats import read_matrix
 from polymerge_core.job import Job, split_off
 from polymerge_core.options import AGGREGATES, INSTANCE_FROM, METHODS, Options
+from polymerge_core.schema import AREAS_LAYER, ELEMENTS_LAYER, polygons_apart
 from polymerge_core.store.map_file import PATIENCE_S
 from polymerge_core.streaming import run_stream
 
@@ -353,7 +354,7 @@ def changes(stored: Path, output: Path, since: int, **chosen: Any) -> None:
     with Job(output, [str(stored)], ["changes", "moves"], **split_off(chosen)) as job:
         found = pm.MapStore(stored).changes(since)
         moves = pm.MapStore(stored).moves(since)
-        job.write({"changes": found, "moves": moves}, 0.7)
+        job.write(polygons_apart("changes", "changes_areas", found) | {"moves": moves}, 0.7)
         kinds = {str(kind): int(count) for kind, count in found["kind"].value_counts(sort=False).items()}
         job.report({"since": since, "changes": kinds})
     listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "no changes"
@@ -369,7 +370,7 @@ def restore(stored: Path, output: Path, revision: int, **chosen: Any) -> None:
     """Write the stored map MAP as it was at a revision; MAP itself is left alone."""
     with Job(output, [str(stored)], ["elements"], **split_off(chosen)) as job:
         elements = pm.MapStore(stored).elements(revision)
-        job.write({"elements": elements}, 0.7)
+        job.write(polygons_apart(ELEMENTS_LAYER, AREAS_LAYER, elements), 0.7)
         job.report({"revision": revision, "elements": len(elements)})
     console.say(f"{_count(len(elements), 'element')} of revision {revision} -> {job.written}")
 

@@ -33,6 +33,7 @@ from polymerge_core.schema import (
     LEFT_OUT_TABLE,
     LINEAGE_TABLE,
     LocalMaps,
+    polygons_apart,
 )
 from polymerge_core.sets import ElementSets, Input, Progress, as_local_maps, find_network, note_layers_apart, order_sets
 
@@ -78,10 +79,7 @@ class MergeResult:
             `elements`, the tables, and, where the map holds polygons beside lines, the polygons apart in
             `elements_areas`: the formats hold one type of geometry.
         """
-        polygon = self.elements.geom_type == "Polygon"
-        layers = {ELEMENTS_LAYER: self.elements}
-        if polygon.any() and not polygon.all():
-            layers = {ELEMENTS_LAYER: self.elements[~polygon], AREAS_LAYER: self.elements[polygon]}
+        layers = polygons_apart(ELEMENTS_LAYER, AREAS_LAYER, self.elements)
         tables = {LINEAGE_TABLE: self.lineage, LEFT_OUT_TABLE: self.left_out, ALIASES_TABLE: self.id_aliases}
         return layers | tables
 

@@ -122,6 +122,17 @@ def find_column(columns: Iterable[object], name: str, *, named: bool, where: str
     return alike[0] if alike else None
 
 
+def polygons_apart(name: str, areas_name: str, frame: gpd.GeoDataFrame) -> dict[str, gpd.GeoDataFrame]:
+    """Return a layer by its name; where it holds polygons beside lines, these under a name of their own.
+
+    The formats hold one type of geometry in a layer.
+    """
+    polygon = frame.geom_type == "Polygon"
+    if polygon.any() and not polygon.all():
+        return {name: frame[~polygon], areas_name: frame[polygon]}
+    return {name: frame}
+
+
 def empty_table(columns: Iterable[str]) -> pd.DataFrame:
     """Return a table without rows whose columns have the contract's types."""
     text = ("source", "drive", "instance", "reason")

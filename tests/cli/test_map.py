@@ -16,7 +16,7 @@ import shapely
 import polymerge_core as pm
 from polymerge_core.store.geopackage import connect
 from polymerge_core.streaming import run_stream
-from tests.cli.layers import EAST, NORTH, UTM, draw, line, look
+from tests.cli.layers import EAST, NORTH, UTM, area, draw, line, look
 from tests.core.layers import read_only
 
 CRS = ("--crs", UTM)
@@ -506,3 +506,19 @@ def test_a_map_is_read_by_merge_as_a_main_map(run, made, files, tmp_path):
     merged = gpd.read_file(tmp_path / "merged.gpkg", layer="elements")
     assert sorted(merged["element_id"]) == [1, 2]
     assert merged["n_instances"].tolist() == [3, 3]
+
+
+def test_lines_and_polygons_of_a_map_are_written_apart(run, tmp_path):
+    crossing = area((40, -5), (44, -5), (44, 5), (40, 5))
+    seen = {"instance": [0], "drive": ["monday"]}
+    local = draw(tmp_path / "monday.gpkg", [along(0)], layer="lines", **seen, **{"class": ["divider"]})
+    draw(local, [crossing], layer="areas", **seen, **{"class": ["ped_crossing"]})
+    city = tmp_path / "city.gpkg"
+    assert run("update", city, local, "--create").code == 0
+    old, changes = tmp_path / "old.gpkg", tmp_path / "changes.gpkg"
+    assert run("restore", city, "--revision", 1, "-o", old).code == 0
+    assert run("changes", city, "-o", changes).code == 0
+    for file, name in ((old, "elements"), (changes, "changes")):
+        assert look(file, name).geom_type.tolist() == ["LineString"]
+        assert look(file, f"{name}_areas").geom_type.tolist() == ["Polygon"]
+    assert run("verify", city).code == 0
