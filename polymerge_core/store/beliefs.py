@@ -40,11 +40,11 @@ DETECTION = (0.2, 0.95)
 #: The chance where it is not known what local maps look at.
 _USUAL = 0.7
 
-#: What all frames of a drive say together counts at most this much: log-odds, 20 to 1.
-DRIVE = 3.0
+#: What all frames of a drive say together counts at most this much: log-odds, 33 to 1.
+DRIVE = 3.5
 
 #: The chance that a place changes between two drives.
-CHANGE = 0.01
+CHANGE = 0.005
 
 #: From these log-odds on an element is sure, 20 to 1.
 SURE_OF = 3.0
@@ -63,6 +63,11 @@ _WINDOW = 40.0
 
 #: Drives are taken to be at least this far apart in what they say of a line, proximities.
 _LEAST = 0.1
+
+#: That drives differ as usual is as sure as if so many had said so.
+_USUAL_DRIVES = 6.0
+
+_TINY = float(np.finfo(float).tiny)
 
 #: Median absolute deviation to standard deviation, for normal errors.
 _MAD = 1.4826
@@ -138,7 +143,8 @@ def judge_elements(
     places = _places(elements, is_area, place, unit)
     drive, order = drives_in_order(instances)
     seen = _sightings(places, elements, lineage, observations, unit)
-    stories = _stories(places, seen, instances, drive, len(order), unit)
+    cls = elements["class"].to_numpy()[places.element]
+    stories = _stories(places, cls, seen, instances, drive, len(order), unit)
     total = stories.sum(axis=1)
     evidence = pd.Series(total).groupby(places.element).median().reindex(range(len(elements))).to_numpy(dtype=float)
     if len(order) < 2:
@@ -194,7 +200,13 @@ def _sightings(
 
 
 def _stories(
-    places: Places, seen: pd.DataFrame, instances: gpd.GeoDataFrame, drive: Index, drives: int, unit: float
+    places: Places,
+    cls: NDArray[np.object_],
+    seen: pd.DataFrame,
+    instances: gpd.GeoDataFrame,
+    drive: Index,
+    drives: int,
+    unit: float,
 ) -> Array:
     """Return what each drive says of each place: log-odds, shape (places, drives)."""
     footprints = instances.geometry.to_numpy()[:]
@@ -211,9 +223,15 @@ def _stories(
     frames = Instances(drive, None, position, heading)
     times = np.bincount(looked["place"][saw], minlength=len(places.points))
     sure = (times >= SURE)[looked["place"]]
-    points = places.points[looked["place"]]
-    likely = chances(points, frames, looked["instance"].to_numpy(), saw, sure, _SQUARE * unit)
-    likely = np.clip(likely, *DETECTION)
+    points, frame = places.points[looked["place"]], looked["instance"].to_numpy()
+    likely = np.empty(len(looked))
+    whose = cls[looked["place"]]
+    for name in np.unique(whose.astype(str)):
+        own = np.flatnonzero(whose == name)
+        likely[own] = chances(points[own], frames, frame[own], saw[own], sure[own], _SQUARE * unit)
+    # Some places are seen less often than others of their class, such as those near the end of a line.
+    ratio = (times + 1.0) / (np.bincount(looked["place"], likely, minlength=len(times)) + 1.0)
+    likely = np.clip(likely * np.minimum(ratio, 1.0)[looked["place"]], *DETECTION)
     said = np.where(saw, np.log(likely / FALSE_ALARM), np.log((1 - likely) / (1 - FALSE_ALARM)))
     total = np.zeros((len(places.points), drives))
     np.add.at(total, (looked["place"].to_numpy(), drive[looked["instance"]]), said)
@@ -306,6 +324,16 @@ def _steps(offset: Array, variance: Array, unit: float) -> Array:
         error = np.sqrt(
             sum(spread[enough, side].sum(axis=1) / n[enough] ** 2 for side, n in zip(sides, count, strict=True))
         )
+        # Where drives differ more than usual on either side, a step is less sure.
+        apart = sum(
+            (np.where(there, (value - mean[:, None]) ** 2 / np.maximum(spread, _TINY), 0.0)).sum(axis=1)
+            for value, there, spread, mean in (
+                (value[enough, side], there[enough, side], spread[enough, side], mean)
+                for side, mean in zip(sides, means, strict=True)
+            )
+        )
+        free = count[0][enough] + count[1][enough] - 2
+        error *= np.sqrt(np.maximum(1.0, (_USUAL_DRIVES + apart) / (_USUAL_DRIVES + free)))
         # Against a step of any size within reach (Occam's factor).
         size = np.log(np.sqrt(2 * np.pi) * error / (2 * REACH * unit))
         gain[enough, number - 1] = 0.5 * ((means[1] - means[0]) / error) ** 2 + size - _COST
