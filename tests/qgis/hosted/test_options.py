@@ -50,6 +50,7 @@ ONLY_IN_THE_COMMAND_LINE = {
     "LOCAL": "LOCAL_MAPS",
     "STREAM": "a program that sends local maps",
     "DRAW_EVERY": "of a stream",
+    "PATIENCE": "of programs; the default is right for a person",
     "OVERWRITE": "the file is always new",
     "JSON": "REPORT",
     "PROGRESS": "always json",
