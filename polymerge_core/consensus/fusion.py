@@ -26,7 +26,7 @@ CORRELATION = 20.0
 HALF_WEIGHT = 2.385
 
 #: Median absolute deviation to standard deviation, for normal errors.
-_MAD = 1.4826
+MAD = 1.4826
 
 #: Noise is taken to be at least this many proximities: less is told apart by nobody, and weights stay finite.
 _LEAST = 0.01
@@ -182,10 +182,10 @@ def _noise_by_distance(looks: Looks, group: Index, feet: Feet, used: NDArray[np.
     residual, distance = np.abs(feet.lateral[judged]), looks.distance
     edges = np.unique(np.quantile(distance[judged], np.linspace(0, 1, _BINS + 1)))
     if len(edges) < 3:
-        return np.full(len(used), max(least, _MAD * float(np.median(residual))))
+        return np.full(len(used), max(least, MAD * float(np.median(residual))))
     bin_of = np.clip(np.searchsorted(edges, distance[judged], side="right") - 1, 0, len(edges) - 2)
     where = np.array([distance[judged][bin_of == number].mean() for number in range(len(edges) - 1)])
-    spread = np.array([_MAD * np.median(residual[bin_of == number]) for number in range(len(edges) - 1)])
+    spread = np.array([MAD * np.median(residual[bin_of == number]) for number in range(len(edges) - 1)])
     slope = max(0.0, float(np.polyfit(where, spread, 1)[0]))
     base = max(0.2 * float(spread.mean()), float(spread.mean() - slope * where.mean()))
     return np.maximum(least, base + slope * distance)
@@ -203,5 +203,5 @@ def _noise_of_drives(looks: Looks, feet: Feet, used: NDArray[np.bool_], sigma: A
         return 0.0
     mean = np.bincount(place, feet.lateral[rows]) / number
     own = np.bincount(place, sigma[rows] ** 2) / number**2
-    spread = _MAD * float(np.median(np.abs(mean[judged])))
+    spread = MAD * float(np.median(np.abs(mean[judged])))
     return float(np.sqrt(max(0.0, spread**2 - float(np.median(own[judged])))))

@@ -32,7 +32,7 @@ _SHARE = 0.25
 SURE = 3
 
 #: Chances are learned by squares of this many proximities, in the vehicle's frame.
-_SQUARE = 5.0
+SQUARE = 5.0
 
 #: Gaps up to this many proximities are bridged: a predictor draws one line in two pieces.
 _BRIDGED = 5
@@ -132,7 +132,7 @@ def judge(places: Array, pairs: Index, instances: Instances, unit: float, drive:
         own = instances.drive[instance] == drive[place]
         instance, place = instance[own], place[own]
     saw = among(place * count + instance, pairs)
-    chance = chances(places[place], instances, instance, saw, (seen >= SURE)[place], _SQUARE * unit)
+    chance = chances(places[place], instances, instance, saw, (seen >= SURE)[place], SQUARE * unit)
     expected = np.bincount(place, chance, minlength=len(places)).astype(float)
     # A drive should have seen what one of its local maps at least should have.
     passed, inverse = np.unique(place * drives + instances.drive[instance], return_inverse=True)

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from polymerge_core.consensus.alongside import REACH
-from polymerge_core.consensus.fusion import CORRELATION
+from polymerge_core.consensus.fusion import CORRELATION, HALF_WEIGHT, MAD
 from polymerge_core.consensus.looks import Instances
-from polymerge_core.consensus.support import SURE, chances
+from polymerge_core.consensus.support import SQUARE, SURE, chances
 from polymerge_core.curves import Array, Curves, Index, count_up
 from polymerge_core.observations import as_lines
 from polymerge_core.store.evidence import drives_in_order
@@ -69,10 +69,6 @@ _USUAL_DRIVES = 6.0
 
 _TINY = float(np.finfo(float).tiny)
 
-#: Median absolute deviation to standard deviation, for normal errors.
-_MAD = 1.4826
-
-_SQUARE = 5.0
 _COST = -np.log(CHANGE)
 
 
@@ -163,7 +159,7 @@ def _places(elements: gpd.GeoDataFrame, area: NDArray[np.bool_], place: BaseGeom
     points = curves.points_at(line, position)
     half = 0.5 * unit
     chord = curves.points_at(line, position + half) - curves.points_at(line, position - half)
-    chord /= np.maximum(np.hypot(*chord.T), np.finfo(float).tiny)[:, None]
+    chord /= np.maximum(np.hypot(*chord.T), _TINY)[:, None]
     centres = shapely.get_coordinates(shapely.centroid(shapes[area])).reshape(-1, 2)
     every = np.concatenate([points, centres])
     owner = np.concatenate([rows[line], np.flatnonzero(area)])
@@ -209,7 +205,7 @@ def _stories(
     unit: float,
 ) -> Array:
     """Return what each drive says of each place: log-odds, shape (places, drives)."""
-    footprints = instances.geometry.to_numpy()[:]
+    footprints = instances.geometry.to_numpy()
     known = instances["has_footprint"].to_numpy(dtype=bool)
     tree = shapely.STRtree(shapely.points(places.points))
     who = np.flatnonzero(known)
@@ -228,7 +224,7 @@ def _stories(
     whose = cls[looked["place"]]
     for name in np.unique(whose.astype(str)):
         own = np.flatnonzero(whose == name)
-        likely[own] = chances(points[own], frames, frame[own], saw[own], sure[own], _SQUARE * unit)
+        likely[own] = chances(points[own], frames, frame[own], saw[own], sure[own], SQUARE * unit)
     # Some places are seen less often than others of their class, such as those near the end of a line.
     ratio = (times + 1.0) / (np.bincount(looked["place"], likely, minlength=len(times)) + 1.0)
     likely = np.clip(likely * np.minimum(ratio, 1.0)[looked["place"]], *DETECTION)
@@ -356,7 +352,7 @@ def _without_shift(offset: Array, variance: Array, normal: Array) -> Array:
             held = across * weight[:, None]
             shift = np.linalg.solve(held.T @ across + np.eye(2), held.T @ said)
             # Cauchy's weights: what moved does not count.
-            weight = 1 / (1 + ((said - across @ shift) / 2.385) ** 2)
+            weight = 1 / (1 + ((said - across @ shift) / HALF_WEIGHT) ** 2)
         offset[rows, column] -= normal[rows] @ shift
     return offset
 
@@ -370,11 +366,11 @@ def _variance(
     for name in np.unique(cls.astype(str)):
         rows = cls == name
         single = rows[place] & (within != 0)
-        look = (_MAD * float(np.median(np.abs(within[single])))) ** 2 if single.any() else (0.3 * unit) ** 2
+        look = (MAD * float(np.median(np.abs(within[single])))) ** 2 if single.any() else (0.3 * unit) ** 2
         # From one drive to the next: where the road changes but one of these is large.
         step = np.diff(offset[rows], axis=1)
         known = np.isfinite(step)
-        own = (_MAD * float(np.median(np.abs(step[known])))) ** 2 / 2 if known.any() else least
+        own = (MAD * float(np.median(np.abs(step[known])))) ** 2 / 2 if known.any() else least
         usual = float(np.mean(1.0 / many[rows][many[rows] > 0])) if (many[rows] > 0).any() else 1.0
         of_drive[rows] = max(least, own - look * usual)
         of_looks[rows] = look / np.maximum(many[rows], 1)

@@ -349,12 +349,7 @@ class Redraw:
         for number, several in places_of[places_of["row"].isin(drawn["row"])].groupby("row"):
             rows = np.flatnonzero(row == number)
             places = several["shape"].to_numpy()
-            nearest = np.zeros(len(rows), np.intp)
-            if len(places) > 1:
-                middles = _middles(held, lineage.iloc[rows])
-                far = [shapely.distance(shapes[place].line, middles) for place in places]
-                nearest = np.argmin(np.round(far, 6), axis=0)
-            element[rows] = ids[places[nearest]]
+            element[rows] = ids[_nearest(shapes, places, _middles(held, lineage.iloc[rows]))]
         lost = element == NO_ELEMENT
         left_out = merged.left_out[merged.left_out["observation_fid"].isin(here)]
         left_out = pd.concat([left_out, lineage[lost].assign(reason=UNSUPPORTED)], ignore_index=True)
@@ -395,9 +390,7 @@ class Redraw:
                 continue
             seen = geopackage.from_blobs([blob for _, blob in rows])
             mine = np.flatnonzero(ids == own)
-            candidates = np.union1d(places, mine)
-            far = [shapely.distance(shapes[place].line, _middle(seen)) for place in candidates]
-            nearest = ids[candidates[np.argmin(np.round(far, 6), axis=0)]]
+            nearest = ids[_nearest(shapes, np.union1d(places, mine), _middle(seen))]
             self.connection.executemany(
                 "UPDATE lineage SET element_id = ? WHERE fid = ?",
                 [(int(now), fid) for now, (fid, _) in zip(nearest, rows, strict=True) if now != own],
@@ -597,6 +590,12 @@ def _votes(merged: Merged, context: Context, before: pd.DataFrame) -> pd.DataFra
     both = both.assign(length=length.astype(np.float64))[(length > 0).to_numpy()]
     found = both.groupby(["row", "element_id"], as_index=False)["length"].sum()
     return found.astype({"row": np.intp, "element_id": np.int64})
+
+
+def _nearest(shapes: list[Shape], rows: Index, points: NDArray[np.object_]) -> Index:
+    """Return which of some shapes (rows) each point is nearest to."""
+    far = [shapely.distance(shapes[row].line, points) for row in rows]
+    return np.asarray(rows[np.argmin(np.round(far, 6), axis=0)])
 
 
 def _middles(observations: gpd.GeoDataFrame, intervals: pd.DataFrame) -> NDArray[np.object_]:
