@@ -4,81 +4,21 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 import geopandas as gpd
 import numpy as np
 
 import polymerge_core as pm
-from polymerge_core import console
-from polymerge_core.crs import parse_crs
+from polymerge_core import console, map_commands
+from polymerge_core.command_options import count, known_crs, left_out, output_option, reading_options, run_options
 from polymerge_core.environment import library_versions
 from polymerge_core.evaluation import REGION_FROM
 from polymerge_core.formats import read_matrix
 from polymerge_core.job import Job, split_off
-from polymerge_core.options import AGGREGATES, INSTANCE_FROM, METHODS, Options
-from polymerge_core.schema import AREAS_LAYER, ELEMENTS_LAYER, polygons_apart
-from polymerge_core.store.map_file import PATIENCE_S
-from polymerge_core.streaming import run_stream
-
-_Command = TypeVar("_Command", bound=Callable[..., Any])
-
-
-def _decorate(*options: Callable[[_Command], _Command]) -> Callable[[_Command], _Command]:
-    def apply(command: _Command) -> _Command:
-        for option in reversed(options):
-            command = option(command)
-        return command
-
-    return apply
-
-
-def _known_crs(_context: click.Context, _option: click.Parameter, text: str | None) -> str | None:
-    """Refuse a CRS that nobody knows before anything is read."""
-    if text is not None:
-        try:
-            parse_crs(text)
-        except pm.CrsError as error:
-            raise pm.OptionError(str(error)) from error
-    return text
-
-
-_output = click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The file to write.")
-
-_run_options = _decorate(
-    click.option("--overwrite", is_flag=True, help="Replace existing outputs."),
-    click.option("--json", "report_file", metavar="FILE", help="Write a report as JSON; - for standard output."),
-    click.option("--progress", type=click.Choice(["auto", "json", "none"]), default="auto", show_default=True),
-    click.option("--watch-stdin", is_flag=True, help="Stop, leaving nothing behind, when standard input closes."),
-)
-
-_source_options = _decorate(
-    click.option("--class-field", help="Column of the class.  [default: class, if there is one]"),
-    click.option("--class-name", default="line", show_default=True, help="The class where no column names one."),
-    click.option("--drive-field", help="Column of the drive or survey.  [default: drive, else the file's name]"),
-    click.option("--instance-field", help="Column of the local map (frame).  [default: instance, if there is one]"),
-    click.option("--instance-from", type=click.Choice(INSTANCE_FROM), help="What a local map is."),
-    click.option("--score-field", help="Column of the confidence, 0 to 1.  [default: score, else 1]"),
-    click.option("--min-score", type=float, default=0.0, show_default=True, help="Leave out what is under it."),
-    click.option("--timestamp-field", help="Column that orders the local maps.  [default: timestamp, if any]"),
-)
-
-_reading_options = _decorate(
-    click.option("--main-map", metavar="MAP", help="The map to merge into; its element_id are kept."),
-    _source_options,
-    click.option(
-        "--proximity", type=float, default=1.0, show_default=True, help="How near is near, in metres (Th_prox)."
-    ),
-    click.option("--area", multiple=True, metavar="CLASS", help="A class of areas, beside ped_crossing; repeatable."),
-    click.option("--crs", callback=_known_crs, help="CRS of layers without one, such as EPSG:32632, or local."),
-    click.option(
-        "--out-crs", callback=_known_crs, help="CRS of the result.  [default: the main map's, else the first layer's]"
-    ),
-    click.option("--strict", is_flag=True, help="A feature that cannot be used is an error."),
-)
+from polymerge_core.options import AGGREGATES, METHODS, Options
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, no_args_is_help=False)
@@ -90,7 +30,7 @@ def cli() -> None:
 @cli.command()
 @click.argument("predictions", type=click.Path())
 @click.option("--poses", required=True, type=click.Path(), help="Poses as CSV or JSON.")
-@click.option("--crs", required=True, callback=_known_crs, help="CRS of the result, such as EPSG:32617, or local.")
+@click.option("--crs", required=True, callback=known_crs, help="CRS of the result, such as EPSG:32617, or local.")
 @click.option(
     "--pose-kind",
     type=click.Choice(["crs", "origin", "geodetic", "offset"]),
@@ -109,8 +49,8 @@ def cli() -> None:
     help="What the predictor looks at, in the vehicle's frame, metres.",
 )
 @click.option("--drive", help="Name of the drive.  [default: the output's name]")
-@_output
-@_run_options
+@output_option
+@run_options
 def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None, **chosen: Any) -> None:
     """Carry a predictor's local maps from the vehicle's frame into the world."""
     run = split_off(chosen)
@@ -130,14 +70,14 @@ def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None
         report = local.report()
         job.report(report)
     console.say(
-        f"{_count(report['observations'], 'observation')} of {_count(report['instances'], 'local map')}"
-        f"{_left_out(report['left_out'])} -> {job.written}"
+        f"{count(report['observations'], 'observation')} of {count(report['instances'], 'local map')}"
+        f"{left_out(report['left_out'])} -> {job.written}"
     )
 
 
 @cli.command()
 @click.argument("local_maps", nargs=-1, required=True, metavar="LOCAL...")
-@_reading_options
+@reading_options
 @click.option(
     "--method",
     type=click.Choice(METHODS),
@@ -158,8 +98,8 @@ def project(predictions: str, poses: str, output: Path, lidar_to_ego: str | None
     metavar="[COLUMN=]FUNCTION",
     help=f"How columns are carried: {', '.join(AGGREGATES)}; repeatable.  [default: first]",
 )
-@_output
-@_run_options
+@output_option
+@run_options
 def merge(local_maps: tuple[str, ...], output: Path, main_map: str | None, **chosen: Any) -> None:
     """Merge local maps (FILE, or "FILE|layername=LAYER" in quotes) into one map."""
     run = split_off(chosen)
@@ -177,18 +117,18 @@ def merge(local_maps: tuple[str, ...], output: Path, main_map: str | None, **cho
     for warning in report["warnings"]:
         console.say(f"warning: {warning}")
     kept = report["main_map_elements"]
-    into_what = "" if main_map is None else f" and {_count(kept, 'element')} of the main map"
+    into_what = "" if main_map is None else f" and {count(kept, 'element')} of the main map"
     console.say(
-        f"{_count(report['observations'], 'observation')} of {_count(report['instances'], 'local map')}{into_what} "
-        f"became {_count(report['elements'], 'element')}{_left_out(report['left_out'])} -> {job.written}"
+        f"{count(report['observations'], 'observation')} of {count(report['instances'], 'local map')}{into_what} "
+        f"became {count(report['elements'], 'element')}{left_out(report['left_out'])} -> {job.written}"
     )
 
 
 @cli.command()
 @click.argument("local_maps", nargs=-1, required=True, metavar="LOCAL...")
-@_reading_options
-@_output
-@_run_options
+@reading_options
+@output_option
+@run_options
 def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **chosen: Any) -> None:
     """Write who would be merged with whom by --method polymerge: layers edges and observations."""
     run = split_off(chosen)
@@ -211,9 +151,9 @@ def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **c
         }
         job.report(report)
     console.say(
-        f"{_count(report['observations'], 'observation')}, {_count(report['edges'], 'edge')}, "
-        f"{_count(report['components'], 'component')} (the largest has {report['largest_component']})"
-        f"{_left_out(report['left_out'])} -> {job.written}"
+        f"{count(report['observations'], 'observation')}, {count(report['edges'], 'edge')}, "
+        f"{count(report['components'], 'component')} (the largest has {report['largest_component']})"
+        f"{left_out(report['left_out'])} -> {job.written}"
     )
 
 
@@ -228,10 +168,10 @@ def network(local_maps: tuple[str, ...], output: Path, main_map: str | None, **c
 @click.option("--class-name", default="line", show_default=True, help="The class where no column names one.")
 @click.option("--score-field", help="Column of the confidence, 0 to 1.  [default: score, else 1]")
 @click.option("--area", multiple=True, metavar="CLASS", help="A class of areas, beside ped_crossing; repeatable.")
-@click.option("--crs", callback=_known_crs, help="CRS of layers without one, such as EPSG:32632, or local.")
+@click.option("--crs", callback=known_crs, help="CRS of layers without one, such as EPSG:32632, or local.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="A page with tables and pictures, HTML.")
 @click.option("--layers", type=click.Path(path_type=Path), help="The errors along the lines, as layers.")
-@_run_options
+@run_options
 def evaluate(
     merged: tuple[str, ...],
     reference: tuple[str, ...],
@@ -268,121 +208,11 @@ def evaluate(
     if run["report_file"] != "-":
         click.echo(result.summary())
     if job.written:
-        console.say(f"{_left_out(result.report['left_out']).removeprefix('; ') or 'done'} -> {job.written}")
+        console.say(f"{left_out(result.report['left_out']).removeprefix('; ') or 'done'} -> {job.written}")
 
 
-@cli.command()
-@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
-@click.argument("local_maps", nargs=-1, metavar="[LOCAL...]")
-@click.option("--create", is_flag=True, help="Make the map if there is none.")
-@click.option("--stream", is_flag=True, help="Read local maps from standard input, one JSON object a line.")
-@click.option("--draw-every", type=click.IntRange(1), default=10, show_default=True, help="Of a stream, in frames.")
-@_source_options
-@click.option("--proximity", type=float, help="Of a map that is made: how near is near, in metres.  [default: 1]")
-@click.option("--area", multiple=True, metavar="CLASS", help="Of a map that is made: a class of areas; repeatable.")
-@click.option(
-    "--patience",
-    type=click.FloatRange(0),
-    default=PATIENCE_S,
-    show_default=True,
-    help="Seconds to wait for another program that has MAP locked.",
-)
-@click.option("--crs", callback=_known_crs, help="CRS of a map that is made, and of layers without one.")
-@click.option("--strict", is_flag=True, help="A feature that cannot be used is an error.")
-@_run_options
-def update(
-    stored: Path,
-    local_maps: tuple[str, ...],
-    *,
-    create: bool,
-    stream: bool,
-    draw_every: int,
-    crs: str | None,
-    proximity: float | None,
-    area: tuple[str, ...],
-    patience: float,
-    **chosen: Any,
-) -> None:
-    """Feed the stored map MAP local maps (FILE, or "FILE|layername=LAYER" in quotes), all of them or none."""
-    run = split_off(chosen)
-    if stream == bool(local_maps):
-        raise click.UsageError("give local maps, or --stream to read them from standard input")
-    if stream and run["watch_stdin"]:
-        raise click.UsageError("--watch-stdin does not go with --stream, which reads standard input")
-    made = crs if create else None
-    with Job(None, local_maps, [], **run) as job:
-        held = pm.MapStore(stored, create=create, crs=made, proximity=proximity, area=area, patience_s=patience)
-        if stream:
-            report = run_stream(held, draw_every=draw_every)
-        else:
-            job.progress(0.0, "reading the files")
-            layers = pm.read_local_maps(local_maps)
-            without = any(maps.observations.crs is None for maps in layers)
-            job.progress(0.2, "updating the map")
-            report = held.update(layers, crs=crs if without else None, **chosen).report()
-        job.report(report)
-    for warning in report["warnings"]:
-        console.say(f"warning: {warning}")
-    what = ", ".join(f"{report[kind]} {kind}" for kind in ("added", "changed", "moved", "retired", "merged"))
-    console.say(
-        f"{_count(report['observations'], 'observation')} of {_count(report['instances'], 'local map')}"
-        f"{_left_out(report['left_out'])}; {_count(report['elements'], 'element')} ({what}) -> {stored}, "
-        f"revision {report['revision']}"
-    )
-
-
-@cli.command()
-@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
-@click.option("--json", "report_file", metavar="FILE", help="Write it as JSON; - for standard output.")
-def history(stored: Path, report_file: str | None) -> None:
-    """List the revisions of the stored map MAP."""
-    with Job(None, [], [], overwrite=True, report_file=report_file, progress="none", watch_stdin=False) as job:
-        revisions = pm.MapStore(stored).history()
-        job.report({"revisions": revisions.to_dict("records")})
-    if report_file is None:
-        shown = revisions.drop(columns="software")
-        click.echo(shown.to_string(index=False) if len(shown) else "no revisions")
-
-
-@cli.command()
-@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
-@click.option("--since", type=click.IntRange(0), default=0, show_default=True, help="A revision; 0 is the empty map.")
-@_output
-@_run_options
-def changes(stored: Path, output: Path, since: int, **chosen: Any) -> None:
-    """Write what became of the elements of the stored map MAP since a revision: layers changes and moves."""
-    with Job(output, [str(stored)], ["changes", "moves"], **split_off(chosen)) as job:
-        found = pm.MapStore(stored).changes(since)
-        moves = pm.MapStore(stored).moves(since)
-        job.write(polygons_apart("changes", "changes_areas", found) | {"moves": moves}, 0.7)
-        kinds = {str(kind): int(count) for kind, count in found["kind"].value_counts(sort=False).items()}
-        job.report({"since": since, "changes": kinds})
-    listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "no changes"
-    console.say(f"{listed} -> {job.written}")
-
-
-@cli.command()
-@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
-@click.option("--revision", type=click.IntRange(1), required=True, help="Which one.")
-@_output
-@_run_options
-def restore(stored: Path, output: Path, revision: int, **chosen: Any) -> None:
-    """Write the stored map MAP as it was at a revision; MAP itself is left alone."""
-    with Job(output, [str(stored)], ["elements"], **split_off(chosen)) as job:
-        elements = pm.MapStore(stored).elements(revision)
-        job.write(polygons_apart(ELEMENTS_LAYER, AREAS_LAYER, elements), 0.7)
-        job.report({"revision": revision, "elements": len(elements)})
-    console.say(f"{_count(len(elements), 'element')} of revision {revision} -> {job.written}")
-
-
-@cli.command()
-@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
-def verify(stored: Path) -> None:
-    """Check that everything that must hold of the file of the stored map MAP does."""
-    found = pm.MapStore(stored).verify()
-    if found:
-        raise pm.InputError(f"{stored} is damaged: {'; '.join(found)}; restore it from a copy")
-    console.say(f"{stored} is whole")
+for _command in map_commands.COMMANDS:
+    cli.add_command(_command)
 
 
 @cli.command("demo")
@@ -440,17 +270,6 @@ def _aggregate(chosen: tuple[str, ...]) -> str | dict[str, str]:
     if plain:
         return plain[0]
     return dict(entry.rsplit("=", 1) for entry in chosen) or "first"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
-def _left_out(reasons: dict[str, int]) -> str:
-    if not reasons:
-        return ""
-    listed = ", ".join(f"{reason}: {count}" for reason, count in sorted(reasons.items()))
-    return f"; {sum(reasons.values())} left out ({listed})"
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -149,13 +149,12 @@ def _boxes(shapes: NDArray[np.object_], owner: Index, count: int) -> NDArray[np.
 def without_known(connection: sqlite3.Connection, evidence: Evidence) -> tuple[Evidence, int]:
     """Leave away the local maps that the map knows; return how many those are."""
     instances = evidence.instances
-    known = np.array(
-        [
-            connection.execute("SELECT 1 FROM instances WHERE drive = ? AND instance = ?", pair).fetchone() is not None
-            for pair in zip(instances["drive"], instances["instance"], strict=True)
-        ],
-        dtype=bool,
-    )
+    with geopackage.pairs(connection, instances["drive"], instances["instance"]) as these:
+        rows = connection.execute(
+            f"SELECT p.id FROM {these} p JOIN instances i ON i.drive = p.one AND i.instance = p.other"
+        ).fetchall()
+    known = np.zeros(len(instances), dtype=bool)
+    known[[row[0] for row in rows]] = True
     if not known.any():
         return evidence, 0
     number = np.cumsum(~known) - 1
@@ -237,15 +236,23 @@ class Context(NamedTuple):
 def read_context(connection: sqlite3.Connection, settings: Settings, place: BaseGeometry) -> Context:
     """Read what the local maps that looked at a place saw there and elsewhere."""
     shapely.prepare(place)
-    box = shapely.bounds(place)
-    near = geopackage.ids_near(connection, "instances", box)
+    near = geopackage.ids_near(connection, "instances", shapely.bounds(place))
     instances = _read(connection, settings, "instances", _INSTANCE, near, "fid")
     instances = instances[shapely.intersects(place, instances.geometry.to_numpy())]
     instances = instances[_heard(instances, settings.proximity)]
     observations = _read(connection, settings, "observations", _OBSERVATION, instances.index.to_numpy(), "instance_fid")
-    wide = shapely.total_bounds(observations.geometry.to_numpy()) if len(observations) else box
-    changed = geopackage.ids_near(connection, "renewed", wide)
-    return Context(instances, observations, _read(connection, settings, "renewed", _RENEWED, changed, "fid"))
+    nothing = _read(connection, settings, "renewed", _RENEWED, np.empty(0, np.intp), "fid")
+    context = Context(instances, observations, nothing)
+    return context._replace(renewed=read_renewed(connection, settings, context))
+
+
+def read_renewed(connection: sqlite3.Connection, settings: Settings, context: Context) -> gpd.GeoDataFrame:
+    """Read where the road changed among all that is seen."""
+    shapes = np.concatenate([context.instances.geometry.to_numpy(), context.observations.geometry.to_numpy()])
+    near = np.empty(0, np.intp)
+    if len(shapes):
+        near = geopackage.ids_near(connection, "renewed", shapely.total_bounds(shapes))
+    return _read(connection, settings, "renewed", _RENEWED, near, "fid")
 
 
 def drives_in_order(instances: gpd.GeoDataFrame) -> tuple[Index, Index]:

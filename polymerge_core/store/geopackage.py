@@ -273,6 +273,16 @@ def chosen(connection: sqlite3.Connection, ids: Index) -> Iterator[str]:
     yield "(SELECT id FROM chosen)"
 
 
+@contextlib.contextmanager
+def pairs(connection: sqlite3.Connection, one: Iterable[str], other: Iterable[str]) -> Iterator[str]:
+    """Give SQL for a table of some pairs: ``id`` (0, 1, ...), ``one``, ``other``."""
+    connection.execute("CREATE TEMP TABLE IF NOT EXISTS pairs (id INTEGER PRIMARY KEY, one TEXT, other TEXT)")
+    connection.execute("DELETE FROM pairs")
+    rows = ((number, *pair) for number, pair in enumerate(zip(one, other, strict=True)))
+    connection.executemany("INSERT INTO pairs VALUES (?, ?, ?)", rows)
+    yield "pairs"
+
+
 def to_blobs(shapes: NDArray[np.object_], srs_id: int) -> list[bytes]:
     """Encode geometries as GeoPackage has them: a header with their bounds, then WKB."""
     header = np.zeros(len(shapes), _HEADER)
@@ -289,10 +299,10 @@ def to_blobs(shapes: NDArray[np.object_], srs_id: int) -> list[bytes]:
     ]
 
 
-def from_blobs(blobs: Sequence[bytes]) -> NDArray[np.object_]:
-    """Decode geometries; the reverse of `to_blobs`, for every header that the standard allows."""
+def from_blobs(blobs: Sequence[bytes | None]) -> NDArray[np.object_]:
+    """Decode geometries; the reverse of `to_blobs`, for every header that the standard allows. NULL is None."""
     wkb = np.empty(len(blobs), dtype=object)
-    wkb[:] = [blob[_body(blob) :] for blob in blobs]
+    wkb[:] = [None if blob is None else blob[_body(blob) :] for blob in blobs]
     shapes: NDArray[np.object_] = shapely.from_wkb(wkb)
     return shapes
 

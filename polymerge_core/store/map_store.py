@@ -21,15 +21,16 @@ from shapely.geometry.base import BaseGeometry
 from polymerge_core.consensus.alongside import REACH
 from polymerge_core.crs import is_local, is_metric, parse_crs
 from polymerge_core.errors import CrsError, InputError, OptionError
-from polymerge_core.observations import as_lines
 from polymerge_core.options import Options
 from polymerge_core.sets import Input, as_local_maps
 from polymerge_core.store import geopackage
+from polymerge_core.store.element_table import Counts, read_elements
 from polymerge_core.store.evidence import Evidence, add, read_evidence, without_known
 from polymerge_core.store.geopackage import Connection, is_empty
 from polymerge_core.store.map_file import PATIENCE_S, MapFile
-from polymerge_core.store.redraw import Counts, Redraw, as_elements, displacement, read_elements
-from polymerge_core.store.tables import ELEMENT, Settings, create_map, read_settings, software
+from polymerge_core.store.past import arrows, changes_since, elements_at
+from polymerge_core.store.redraw import redraw
+from polymerge_core.store.tables import Settings, create_map, read_settings, software
 from polymerge_core.store.verify import faults
 
 #: What a footprint or an observation is wider by than what it says of the map, proximities.
@@ -267,14 +268,7 @@ class MapStore:
             if revision is None:
                 return read_elements(connection, settings).reset_index()
             self._check_revision(connection, revision)
-            names = ", ".join(f'c."{name}"' for name in ELEMENT)
-            rows = connection.execute(
-                f"SELECT c.element_id, c.geom, {names} FROM changes c JOIN (SELECT element_id, MAX(fid) AS last FROM "
-                "changes WHERE revision <= ? GROUP BY element_id) l ON c.fid = l.last "
-                "WHERE c.kind NOT IN ('retired', 'merged') ORDER BY c.element_id",
-                (revision,),
-            ).fetchall()
-            return as_elements(rows, settings).reset_index()
+            return elements_at(connection, settings, revision).reset_index()
 
     def history(self) -> pd.DataFrame:
         """Return the revisions: number, time, source, what was new and what changed, and who wrote it."""
@@ -299,28 +293,7 @@ class MapStore:
         with self._opened() as (connection, settings):
             if since:
                 self._check_revision(connection, since)
-            names = ", ".join(f'"{name}"' for name in ELEMENT)
-            rows = connection.execute(
-                f"SELECT c.element_id, geom, {names}, CASE WHEN l.moved AND c.kind = 'changed' THEN 'moved' "
-                "ELSE c.kind END, c.revision FROM changes c JOIN "
-                "(SELECT MAX(fid) AS last, MAX(kind = 'moved') AS moved FROM changes "
-                "WHERE revision > ? GROUP BY element_id) l ON c.fid = l.last ORDER BY c.element_id",
-                (since,),
-            ).fetchall()
-        now = as_elements([row[:-2] for row in rows], settings)
-        kind = np.array([row[-2] for row in rows], dtype=object)
-        now.insert(0, "kind", kind)
-        now.insert(1, "revision", [row[-1] for row in rows])
-        before = self.elements(since).set_index("element_id") if since else now.iloc[:0]
-        was = before.geometry.reindex(now.index).to_numpy()
-        there, gone = ~pd.isna(was), np.isin(kind, ("retired", "merged"))
-        now.loc[~there & ~gone, "kind"] = "added"
-        now["moved_m"] = [
-            0.0 if one is None or lost else displacement(one, other)
-            for one, other, lost in zip(was, now.geometry, gone, strict=True)
-        ]
-        # What came and went in between is no difference.
-        return now[there | ~gone].reset_index()
+            return changes_since(connection, settings, since)
 
     def moves(self, since: int = 0) -> gpd.GeoDataFrame:
         """Return arrows from where elements were at a revision to where they are: `element_id`, `moved_m`.
@@ -331,13 +304,8 @@ class MapStore:
             A revision.
         """
         found = self.changes(since)
-        found = found[found["kind"] == "moved"]
-        before = self.elements(since).set_index("element_id").geometry if since else found.geometry
-        old = before.reindex(found["element_id"]).to_numpy() if since else before.to_numpy()
-        start = shapely.line_interpolate_point(as_lines(found.geometry.to_numpy()), 0.5, normalized=True)
-        arrows = shapely.reverse(shapely.shortest_line(start, as_lines(old)))
-        columns = {"element_id": found["element_id"].to_numpy(), "moved_m": found["moved_m"].to_numpy()}
-        return gpd.GeoDataFrame(columns, geometry=arrows, crs=found.crs)
+        before = self.elements(since) if since else found
+        return arrows(found, before.set_index("element_id").geometry)
 
     def verify(self) -> list[str]:
         """Check every invariant of the file.
@@ -380,7 +348,7 @@ class MapStore:
         if draw:
             place = waiting(connection, settings)
             if not place.is_empty:
-                counts = Redraw(connection, settings, place, revision).run()
+                counts = redraw(connection, settings, place, revision)
             connection.execute("UPDATE instances SET drawn = ? WHERE drawn IS NULL", (revision,))
         update = Update.of(revision, counts, _count(connection, "elements"), skipped, evidence)
         row = {

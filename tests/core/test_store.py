@@ -22,9 +22,9 @@ import polymerge_core as pm
 from benchmarks.scenarios import town
 from polymerge_core import MapStore
 from polymerge_core.crs import LOCAL_CRS
-from polymerge_core.store import redraw
+from polymerge_core.store import shapes
+from polymerge_core.store.element_table import displacement
 from polymerge_core.store.geopackage import connect
-from polymerge_core.store.map_store import displacement
 from tests.core.layers import read_only
 from tests.core.test_consensus import apart, level, looks
 from tests.core.test_consensus_state import distances, some
@@ -687,10 +687,10 @@ class TestFailing:
         "polymerge_core.store.map_store.read_evidence",
         "polymerge_core.store.map_store.add",
         "polymerge_core.store.map_store.waiting",
-        "polymerge_core.store.redraw.merge",
-        "polymerge_core.store.redraw.put_together",
-        "polymerge_core.store.redraw.Redraw._count",
-        "polymerge_core.store.redraw.Redraw._note",
+        "polymerge_core.store.merging.merge",
+        "polymerge_core.store.shapes.put_together",
+        "polymerge_core.store.redraw.count_looks",
+        "polymerge_core.store.element_table._note",
         "polymerge_core.store.map_store.software",
     )
 
@@ -721,7 +721,7 @@ class TestFailing:
 
     def test_can_be_tried_again(self, store, broken, monkeypatch):
         with monkeypatch.context() as context:
-            context.setattr(redraw, "put_together", lambda *_args: 1 / 0)
+            context.setattr(shapes, "put_together", lambda *_args: 1 / 0)
             with pytest.raises(ZeroDivisionError):
                 store.update(frame(0, level(0, 0, 100)))
         assert store.update(frame(0, level(0, 0, 100))).revision == 1
