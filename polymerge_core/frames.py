@@ -420,6 +420,8 @@ def _layer(columns: dict[str, Any], geometry: NDArray[np.object_], target: pypro
 
 
 def _left_out(vectors: Sequence[LeftOutVector], source: str, drive: str) -> pd.DataFrame:
+    if not vectors:
+        return empty_table(LEFT_OUT_COLUMNS)
     rows = [(source, v.position, drive, v.token, 0.0, v.length_m, v.reason) for v in vectors]
     table = pd.DataFrame(rows, columns=list(LEFT_OUT_COLUMNS))
     typed: pd.DataFrame = table.astype(empty_table(LEFT_OUT_COLUMNS).dtypes.to_dict())

@@ -97,7 +97,12 @@ class Observations:
         return moved
 
 
-def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], options: Options) -> Observations:
+def observe(
+    local_maps: Sequence[LocalMaps],
+    main_map: Sequence[LocalMaps],
+    options: Options,
+    reference: pyproj.CRS | None = None,
+) -> Observations:
     """Read layers into one table of observations.
 
     Parameters
@@ -108,6 +113,8 @@ def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], opti
         The layers of the map to merge them into, if any.
     options : Options
         Columns, classes and CRS.
+    reference : pyproj.CRS, optional
+        Where the work happens if that is true to scale; by default the CRS of the main map, else of the first layer.
 
     Returns
     -------
@@ -127,7 +134,7 @@ def observe(local_maps: Sequence[LocalMaps], main_map: Sequence[LocalMaps], opti
     features, attributes, notes = read_columns(layers, options)
     parts = _explode(features)
     parts = _resolve_kinds(parts, options)
-    layer_crs, reference, work = _choose_crs(layers, parts, options, notes["warnings"])
+    layer_crs, reference, work = _choose_crs(layers, parts, options, reference, notes["warnings"])
     if options.crs is not None and all(layer.data.crs is not None for layer in layers):
         notes["warnings"].append("crs was not used: every layer has a CRS of its own")
     out_crs = reference if options.out_crs is None else parse_crs(options.out_crs)
@@ -232,16 +239,22 @@ def _lines_to_polygons(parts: pd.DataFrame) -> None:
 
 
 def _choose_crs(
-    layers: list[Layer], parts: pd.DataFrame, options: Options, warnings: list[str]
+    layers: list[Layer],
+    parts: pd.DataFrame,
+    options: Options,
+    reference: pyproj.CRS | None,
+    warnings: list[str],
 ) -> tuple[list[pyproj.CRS], pyproj.CRS, pyproj.CRS]:
-    """Return the CRS of every layer, the reference one (main map's, else first) and the working one."""
+    """Return the CRS of every layer, the reference one and the working one."""
     declared = None if options.crs is None else parse_crs(options.crs)
     usable = parts[parts["reason"].isna()]
     bounds = {
         int(number): tuple(shapely.total_bounds(group["shape"].to_numpy())) for number, group in usable.groupby("layer")
     }
     found = [_layer_crs(layer, declared, needed=number in bounds) for number, layer in enumerate(layers)]
-    reference = next((crs for crs in found if crs is not None), declared)
+    given = reference
+    if reference is None:
+        reference = next((crs for crs in found if crs is not None), declared)
     if reference is None:
         raise CrsError(_no_crs(layers[0].where))
     layer_crs = [reference if crs is None else crs for crs in found]
@@ -249,6 +262,8 @@ def _choose_crs(
     placed = [layers[number].where for number in bounds if not is_local(layer_crs[number])]
     # That of the reference counts though it may hold nothing.
     placed += [layer.where for layer, crs in zip(layers, found, strict=True) if crs == reference and not is_local(crs)]
+    if given is not None:
+        (plain if is_local(given) else placed).append("the map")
     if plain and placed:
         raise CrsError(
             f"{plain[0]} has plain metric coordinates (crs=local) and cannot be brought together with {placed[0]}, "
@@ -373,6 +388,8 @@ def list_left_out(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
         `LEFT_OUT_COLUMNS` of all.
     """
     listed = pd.concat([table[list(LEFT_OUT_COLUMNS)] for table in tables])
+    if listed.empty:
+        return listed
     listed["instance"] = listed["instance"].astype(str)
     keys = ["source", "drive", "instance", "reason", "from_m", "to_m", "source_fid"]
     text = listed["source_fid"].astype(str)

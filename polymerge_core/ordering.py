@@ -70,7 +70,10 @@ def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
 
 def _instance_rank(parts: pd.DataFrame) -> NDArray[np.intp]:
     """Rank the local maps; equal content without a name has equal rank, the main map rank -1."""
-    group = parts.groupby(["is_main", "instance_kind", "drive", "instance"], sort=False).ngroup().to_numpy()
+    names = ["is_main", "instance_kind", "drive", "instance"]
+    if len(parts) and all((parts[name] == parts[name].iloc[0]).all() for name in names):
+        return np.full(len(parts), -1 if parts["is_main"].iloc[0] else 0, dtype=np.intp)
+    group = parts.groupby(names, sort=False).ngroup().to_numpy()
     drive_start = parts.groupby("drive")["timestamp_ns"].transform("min").to_numpy()
     first = pd.DataFrame(
         {
@@ -140,6 +143,8 @@ def _tie_break(parts: pd.DataFrame, attributes: pd.DataFrame) -> NDArray[np.obje
     """Return a text that tells apart observations whose class and geometry are the same."""
     tie = np.full(len(parts), "", dtype=object)
     same = parts.duplicated(["class", "exact"], keep=False).to_numpy()
+    if not same.any():
+        return tie
     own = parts.loc[same, ["as_polygon", "score", "main_id", "weight", "looks"]].to_numpy(dtype=object).tolist()
     values = attributes.iloc[parts.loc[same, "feature"]].itertuples(index=False, name=None)
     tie[same] = [repr((*row, *map(str, theirs))) for row, theirs in zip(own, values, strict=True)]

@@ -31,9 +31,6 @@ _NAMES = ["drive", "instance"]
 #: Where very many looked, so many drives are heard in a square of so many proximities, and so many frames of each.
 _DRIVES, _FRAMES, _SQUARE = 16, 16, 30.0
 
-#: What the map is called beside the local maps.
-_MAP = "the stored map"
-
 
 class Evidence(NamedTuple):
     """Local maps, in the CRS of the map.
@@ -87,17 +84,14 @@ def read_evidence(
     SchemaError, InputError
         If a layer cannot be used.
     """
-    columns = {"element_id": pd.Series(dtype="int64"), "class": pd.Series(dtype="str")}
-    main = [] if crs is None else [LocalMaps(gpd.GeoDataFrame(columns, geometry=[], crs=crs), source=_MAP)]
-    seen = observe(list(local_maps), main, options)
+    seen = observe(list(local_maps), [], options, crs)
     if crs is not None and seen.crs != crs:
         raise CrsError(
             f"the map is in {crs_name(crs)}, which is not true to scale (0.1 %) where the local maps are; keep another "
             "map for them"
         )
     table = seen.table
-    layer_crs = seen.layer_crs[len(main) :]
-    known = [known_instances(maps, each, seen.crs) for maps, each in zip(local_maps, layer_crs, strict=True)]
+    known = [known_instances(maps, each, seen.crs) for maps, each in zip(local_maps, seen.layer_crs, strict=True)]
     unseen = seen.left_out.loc[seen.left_out["instance"] != "", _NAMES].astype(str)
     names = [table[_NAMES].astype(str), *(each[_NAMES] for each in known), unseen]
     every = pd.concat(names, ignore_index=True).drop_duplicates().reset_index(drop=True)
@@ -112,8 +106,13 @@ def read_evidence(
             "shape": np.where(table["is_area"] & ~table["as_polygon"], as_lines(shape), shape),
         }
     )
-    told = pd.concat([*known, known_instances(LocalMaps(_nothing(seen.crs)), seen.crs, seen.crs)], ignore_index=True)
-    told = told.drop_duplicates(_NAMES).set_index(_NAMES).reindex(index).reset_index(drop=True)
+    told = (
+        pd.concat(known, ignore_index=True)
+        .drop_duplicates(_NAMES)
+        .set_index(_NAMES)
+        .reindex(index)
+        .reset_index(drop=True)
+    )
     told = every.join(told)
     earliest = pd.Series(NO_TIMESTAMP, index=every.index)
     if len(table):
@@ -128,13 +127,7 @@ def read_evidence(
     told["has_footprint"] = ~pd.isna(footprint)
     boxes = _boxes(shape, at, len(every))
     told["shape"] = np.where(told["has_footprint"], footprint, boxes)
-    # Of the map only the CRS was given.
-    warnings = [warning for warning in seen.notes["warnings"] if repr(_MAP) not in warning]
-    return Evidence(told, observations, seen.left_out, warnings), seen.crs
-
-
-def _nothing(crs: pyproj.CRS) -> gpd.GeoDataFrame:
-    return gpd.GeoDataFrame(geometry=[], crs=crs)
+    return Evidence(told, observations, seen.left_out, seen.notes["warnings"]), seen.crs
 
 
 def _boxes(shapes: NDArray[np.object_], owner: Index, count: int) -> NDArray[np.object_]:
