@@ -29,7 +29,7 @@ from polymerge_core.consensus.looks import Instances
 from polymerge_core.consensus.support import SQUARE, SURE, chances
 from polymerge_core.curves import Array, Curves, Index, count_up
 from polymerge_core.observations import as_lines
-from polymerge_core.store.evidence import drives_in_order
+from polymerge_core.store.drive_order import DriveOrder
 
 #: The chance that a local map shows something of a class at a place where there is nothing of it.
 FALSE_ALARM = 0.05
@@ -66,6 +66,9 @@ _LEAST = 0.1
 
 #: That drives differ as usual is as sure as if so many had said so.
 _USUAL_DRIVES = 6.0
+
+#: That drives miss as little as is said above is as sure as if so many places of a drive had said so.
+_USUAL_PLACES = 20.0
 
 _TINY = float(np.finfo(float).tiny)
 
@@ -113,6 +116,7 @@ def judge_elements(
     lineage: pd.DataFrame,
     observations: gpd.GeoDataFrame,
     instances: gpd.GeoDataFrame,
+    order: DriveOrder,
     place: BaseGeometry,
     unit: float,
 ) -> Judgement:
@@ -129,24 +133,24 @@ def judge_elements(
     observations : GeoDataFrame
         `instance` (row), `class`.
     instances : GeoDataFrame
-        The local maps: `drive`, `timestamp_ns`, `revision`, `x`, `y`, `heading`, `has_footprint`; geometry is what they
-        looked at, as far as that still counts.
+        The local maps: `x`, `y`, `heading`, `has_footprint`; geometry is what they looked at, as far as that counts.
+    order : DriveOrder
+        Of their drives.
     place : Polygon or MultiPolygon
         Where all that looked is known.
     unit : float
         The proximity, metres.
     """
     places = _places(elements, is_area, place, unit)
-    drive, order = drives_in_order(instances)
     seen = _sightings(places, elements, lineage, observations, unit)
     cls = elements["class"].to_numpy()[places.element]
-    stories = _stories(places, cls, seen, instances, drive, len(order), unit)
+    stories = _stories(places, cls, seen, instances, order.drive, len(order.first), unit)
     total = stories.sum(axis=1)
     evidence = pd.Series(total).groupby(places.element).median().reindex(range(len(elements))).to_numpy(dtype=float)
-    if len(order) < 2:
+    if len(order.first) < 2:
         return Judgement(evidence, [])
     renewals = _came_or_went(places, elements, stories, order, unit)
-    return Judgement(evidence, renewals + _moved(places, elements, seen, observations, drive, order, unit))
+    return Judgement(evidence, renewals + _moved(places, elements, seen, observations, order, unit))
 
 
 def _places(elements: gpd.GeoDataFrame, area: NDArray[np.bool_], place: BaseGeometry, unit: float) -> Places:
@@ -235,11 +239,27 @@ def _stories(
     inside = pd.MultiIndex.from_frame(sightings).isin(pd.MultiIndex.from_frame(looked))
     others = sightings[~inside]
     np.add.at(total, (others["place"].to_numpy(), drive[others["instance"]]), np.log(_USUAL / FALSE_ALARM))
-    return np.clip(total, -DRIVE, DRIVE)
+    return np.clip(total, -_surest_no(total, cls), DRIVE)
+
+
+def _surest_no(stories: Array, cls: NDArray[np.object_]) -> Array:
+    """Return how much a drive that sees nothing can count at most: log-odds, shape (places, 1).
+
+    Where drives before and after it see something it was there, and a drive that sees nothing missed it, with all its
+    frames. How often that happens is learned for each class: a drive in the next lane, or behind a lorry, misses much.
+    """
+    seen = stories > 0
+    earlier: Index = np.cumsum(seen, axis=1) - seen
+    later = seen.sum(axis=1, keepdims=True) - earlier - seen
+    between = (earlier > 0) & (later > 0) & (stories != 0)
+    names, code = np.unique(cls.astype(str), return_inverse=True)
+    missed, asked = (np.bincount(code, (between & what).sum(axis=1), len(names)) for what in (~seen, True))
+    chance = (missed + _USUAL_PLACES * np.exp(-DRIVE)) / (asked + _USUAL_PLACES)
+    return np.minimum(DRIVE, -np.log(chance))[code][:, None]
 
 
 def _came_or_went(
-    places: Places, elements: gpd.GeoDataFrame, stories: Array, order: Index, unit: float
+    places: Places, elements: gpd.GeoDataFrame, stories: Array, order: DriveOrder, unit: float
 ) -> list[Renewal]:
     before = np.cumsum(stories, axis=1)[:, :-1]
     total = stories.sum(axis=1)
@@ -256,8 +276,7 @@ def _moved(
     elements: gpd.GeoDataFrame,
     seen: pd.DataFrame,
     observations: gpd.GeoDataFrame,
-    drive: Index,
-    order: Index,
+    order: DriveOrder,
     unit: float,
 ) -> list[Renewal]:
     """Find stretches that lie elsewhere since one of the drives."""
@@ -271,13 +290,14 @@ def _moved(
     away = foot - places.points[place]
     aside = (away * places.normal[place]).sum(axis=1)
     beside = np.hypot(*away.T) - np.abs(aside) < 0.5 * unit
-    cell = place[beside] * len(order) + drive[own["instance"].to_numpy()[beside]]
-    many = np.bincount(cell, minlength=len(places.points) * len(order)).reshape(-1, len(order))
+    drives = len(order.first)
+    cell = place[beside] * drives + order.drive[own["instance"].to_numpy()[beside]]
+    many = np.bincount(cell, minlength=len(places.points) * drives).reshape(-1, drives)
     sums = np.bincount(cell, aside[beside], minlength=many.size).reshape(many.shape)
     offset = np.where(many > 0, sums / np.maximum(many, 1), np.nan)
     within = aside[beside] - offset.ravel()[cell]
     cls = elements["class"].to_numpy()[places.element]
-    of_drive, of_looks = _variance(offset, many, within, cell // len(order), cls, unit)
+    of_drive, of_looks = _variance(offset, many, within, cell // drives, cls, unit)
     offset = _without_shift(offset, of_drive + of_looks, places.normal)
 
     half = int(_WINDOW / _STEP / 2)
@@ -382,11 +402,13 @@ def _runs(
     elements: gpd.GeoDataFrame,
     gain: Array,
     kind: str,
-    order: Index,
+    order: DriveOrder,
     unit: float,
     shortest: float = _SHORTEST,
 ) -> list[Renewal]:
     """Return stretches of elements along which a change is the likeliest story, each with its likeliest time."""
+    # Of drives in no order nobody can tell what came first.
+    gain = np.where(order.known, gain, -np.inf)
     best = gain.max(axis=1, initial=-np.inf)
     found = []
     shapes = elements.geometry.to_numpy()
@@ -403,7 +425,7 @@ def _runs(
             if len(sure) == 0 or not (whole or len(sure) * _STEP >= shortest):
                 continue
             zone = shapely.buffer(_along(shapes[element], places.points[inside], whole=whole, unit=unit), REACH * unit)
-            since = int(order[int(np.argmax(gain[sure].sum(axis=0))) + 1])
+            since = int(order.first[int(np.argmax(gain[sure].sum(axis=0))) + 1])
             found.append(Renewal(str(elements["class"].iloc[element]), kind, zone, since))
     return found
 

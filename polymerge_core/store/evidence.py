@@ -23,6 +23,7 @@ from polymerge_core.observations import as_lines, observe
 from polymerge_core.options import Options
 from polymerge_core.schema import LocalMaps
 from polymerge_core.store import geopackage
+from polymerge_core.store.drive_order import came_before, order_drives, read_drives
 from polymerge_core.store.stitching import stretches_of
 from polymerge_core.store.tables import Settings
 
@@ -218,12 +219,15 @@ class Context(NamedTuple):
         All that they saw, also elsewhere, by `fid`: `instance_fid`, `class`, `score`, `is_area`, and where they came
         from.
     renewed : GeoDataFrame
-        Where the road changed: `class`, `since_ns`, `since_revision`.
+        Where the road changed: `class`, and the drive that saw it first, `since_drive`, `since_revision`.
+    drives : DataFrame
+        From `read_drives`, of all these.
     """
 
     instances: gpd.GeoDataFrame
     observations: gpd.GeoDataFrame
     renewed: gpd.GeoDataFrame
+    drives: pd.DataFrame
 
 
 def read_context(connection: sqlite3.Connection, settings: Settings, place: BaseGeometry) -> Context:
@@ -232,43 +236,31 @@ def read_context(connection: sqlite3.Connection, settings: Settings, place: Base
     near = geopackage.ids_near(connection, "instances", shapely.bounds(place))
     instances = _read(connection, settings, "instances", _INSTANCE, near, "fid")
     instances = instances[shapely.intersects(place, instances.geometry.to_numpy())]
-    instances = instances[_heard(instances, settings.proximity)]
+    drives = read_drives(connection, instances.groupby("drive")["revision"].min())
+    instances = instances[_heard(instances, drives, settings.proximity)]
     observations = _read(connection, settings, "observations", _OBSERVATION, instances.index.to_numpy(), "instance_fid")
     nothing = _read(connection, settings, "renewed", _RENEWED, np.empty(0, np.intp), "fid")
-    context = Context(instances, observations, nothing)
-    return context._replace(renewed=read_renewed(connection, settings, context))
+    return with_renewed(connection, settings, Context(instances, observations, nothing, drives))
 
 
-def read_renewed(connection: sqlite3.Connection, settings: Settings, context: Context) -> gpd.GeoDataFrame:
+def with_renewed(connection: sqlite3.Connection, settings: Settings, context: Context) -> Context:
     """Read where the road changed among all that is seen."""
     shapes = np.concatenate([context.instances.geometry.to_numpy(), context.observations.geometry.to_numpy()])
     near = np.empty(0, np.intp)
     if len(shapes):
         near = geopackage.ids_near(connection, "renewed", shapely.total_bounds(shapes))
-    return _read(connection, settings, "renewed", _RENEWED, near, "fid")
+    renewed = _read(connection, settings, "renewed", _RENEWED, near, "fid")
+    told = renewed.groupby("since_drive")["since_revision"].min()
+    others = read_drives(connection, told[~told.index.isin(context.drives.index)])
+    return context._replace(renewed=renewed, drives=pd.concat([context.drives, others]))
 
 
-def drives_in_order(instances: gpd.GeoDataFrame) -> tuple[Index, Index]:
-    """Return the drive of each local map by its place in time, and the first local map (row) of each drive."""
-    held = pd.DataFrame(
-        {
-            "drive": instances["drive"].to_numpy(),
-            "time": instances["timestamp_ns"].astype("Float64").fillna(np.inf).to_numpy(dtype=float),
-            "revision": instances["revision"].to_numpy(),
-            "row": np.arange(len(instances)),
-        }
-    )
-    first = held.sort_values(["time", "revision", "row"]).drop_duplicates("drive").reset_index(drop=True)
-    number = pd.Series(first.index, index=first["drive"])
-    return number.reindex(held["drive"]).to_numpy(dtype=np.intp), first["row"].to_numpy(dtype=np.intp)
-
-
-def _heard(instances: gpd.GeoDataFrame, unit: float) -> NDArray[np.bool_]:
+def _heard(instances: gpd.GeoDataFrame, drives: pd.DataFrame, unit: float) -> NDArray[np.bool_]:
     """Choose who is heard where very many looked: of each square the newest drives, of each drive some frames by lot.
 
     The lot is the same at all times, so that a place is drawn from the same frames whoever draws it.
     """
-    drive, _ = drives_in_order(instances)
+    drive = order_drives(instances, drives).drive
     middle = np.floor(shapely.get_coordinates(shapely.centroid(instances.geometry.to_numpy())) / (_SQUARE * unit))
     lot = pd.util.hash_pandas_object(instances["drive"] + "\n" + instances["instance"], index=False).to_numpy()
     held = pd.DataFrame({"x": middle[:, 0], "y": middle[:, 1], "drive": drive, "lot": lot})
@@ -280,7 +272,7 @@ def _heard(instances: gpd.GeoDataFrame, unit: float) -> NDArray[np.bool_]:
 
 _INSTANCE = ("drive", "instance", "timestamp_ns", "x", "y", "heading", "has_footprint", "revision")
 _OBSERVATION = ("instance_fid", "class", "score", "is_area", "source", "source_fid", "from_m", "to_m")
-_RENEWED = ("class", "since_ns", "since_revision")
+_RENEWED = ("class", "since_drive", "since_revision")
 
 
 def _read(
@@ -303,7 +295,7 @@ def _read(
     return gpd.GeoDataFrame(frame, geometry=geopackage.from_blobs(held[1]), crs=settings.crs)
 
 
-_WHOLE = ("timestamp_ns", "since_ns")
+_WHOLE = ("timestamp_ns",)
 
 
 class Pieces(NamedTuple):
@@ -339,7 +331,7 @@ def still_valid(context: Context) -> Pieces:
     footprints = instances.geometry.to_numpy().copy()
     cut: dict[int, BaseGeometry] = {}
     for zone in context.renewed.itertuples():
-        before = _before(instances, zone)
+        before = came_before(instances, context.drives, zone.since_drive)
         near = before & shapely.intersects(footprints, zone.geometry)
         footprints[near] = shapely.difference(footprints[near], zone.geometry)
         own = before[instances.index.get_indexer(seen["instance_fid"])] & (seen["class"] == zone[1]).to_numpy()
@@ -376,17 +368,6 @@ def still_valid(context: Context) -> Pieces:
     known = instances.assign(geometry=footprints)[(instances["has_footprint"] == 1).to_numpy()]
     table = pd.DataFrame(lost, columns=["observation_fid", "from_m", "to_m"])
     return Pieces(LocalMaps(observations, known, source="map"), footprints, own.index.to_numpy(), offset, table)
-
-
-def _before(instances: gpd.GeoDataFrame, zone: Any) -> NDArray[np.bool_]:
-    """Tell which local maps were taken before the road changed."""
-    time = instances["timestamp_ns"]
-    earlier = (instances["revision"] < zone.since_revision).to_numpy(dtype=bool, copy=True)
-    if pd.isna(zone.since_ns):
-        return earlier
-    known = time.notna().to_numpy()
-    earlier[known] = (time[known] < zone.since_ns).to_numpy(dtype=bool)
-    return earlier
 
 
 def _rest(shape: BaseGeometry, zone: BaseGeometry, *, is_area: bool) -> list[tuple[float, float]]:

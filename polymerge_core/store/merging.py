@@ -14,7 +14,8 @@ from polymerge_core.consensus.alongside import REACH
 from polymerge_core.consensus.run import UNSUPPORTED
 from polymerge_core.merge import merge
 from polymerge_core.observations import as_lines
-from polymerge_core.store.evidence import Context, Pieces, drives_in_order, still_valid
+from polymerge_core.store.drive_order import order_drives
+from polymerge_core.store.evidence import Context, Pieces, still_valid
 from polymerge_core.store.tables import Settings
 
 #: Why a piece of an observation is in no element.
@@ -60,7 +61,7 @@ def newest(context: Context, merged: Merged, settings: Settings) -> tuple[gpd.Ge
     lineage : DataFrame
         `element` (row), `observation` (row of the pieces).
     """
-    drive, first = drives_in_order(context.instances)
+    drive, first, _ = order_drives(context.instances, context.drives)
     maps = merged.pieces.local_maps
     nothing = (
         merged.elements[["class", "geometry"]].iloc[:0],

@@ -20,8 +20,9 @@ from polymerge_core.consensus.alongside import REACH
 from polymerge_core.schema import NO_ELEMENT
 from polymerge_core.store import geopackage
 from polymerge_core.store.beliefs import Renewal, judge_elements
+from polymerge_core.store.drive_order import order_drives
 from polymerge_core.store.element_table import Counts, count_looks, displacement, read_elements, write_elements
-from polymerge_core.store.evidence import Context, read_context, read_renewed
+from polymerge_core.store.evidence import Context, read_context, with_renewed
 from polymerge_core.store.identity import assign_ids, count_votes
 from polymerge_core.store.lineage import attribute, list_unheard, read_lineage, share_out
 from polymerge_core.store.merging import Merged, merge_all, newest
@@ -100,7 +101,7 @@ def _merged(
             break
         _note(connection, settings, context, new, revision)
         found += new
-        context = context._replace(renewed=read_renewed(connection, settings, context))
+        context = with_renewed(connection, settings, context)
         merged = merge_all(context, settings)
     return merged, found
 
@@ -121,7 +122,8 @@ def _judge(context: Context, merged: Merged, place: BaseGeometry, settings: Sett
         lineage = pd.concat([lineage, theirs.assign(element=theirs["element"] + len(elements))], ignore_index=True)
         elements = pd.concat([elements, late], ignore_index=True)
     area = is_area(elements, settings)
-    judged = judge_elements(elements, area, lineage, observations, instances, place, settings.proximity)
+    order = order_drives(context.instances, context.drives)
+    judged = judge_elements(elements, area, lineage, observations, instances, order, place, settings.proximity)
     merged.elements["evidence"] = judged.evidence[: len(merged.elements)]
     return judged.renewals
 
@@ -136,7 +138,7 @@ def _note(
         "geom": geopackage.to_blobs(shapes, settings.srs_id),
         "class": [renewal.cls for renewal in renewals],
         "kind": [renewal.kind for renewal in renewals],
-        "since_ns": [None if pd.isna(time) else int(time) for time in first["timestamp_ns"]],
+        "since_drive": first["drive"],
         "since_revision": first["revision"],
         "revision": [revision] * len(shapes),
     }

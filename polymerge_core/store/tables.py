@@ -78,7 +78,7 @@ _LAYERS = {
     # Where the road is known to have changed: what was seen of the class there before says nothing of it now.
     "renewed": (
         "fid",
-        {"class": "TEXT", "kind": "TEXT", "since_ns": "INTEGER", "since_revision": "INTEGER", "revision": "INTEGER"},
+        {"class": "TEXT", "kind": "TEXT", "since_drive": "TEXT", "since_revision": "INTEGER", "revision": "INTEGER"},
         "GEOMETRY",
     ),
 }
@@ -122,6 +122,7 @@ _TABLES = {
 
 _INDEXES = (
     ("instances", "drive, instance", True),
+    ("instances", "drive, timestamp_ns", False),
     ("instances", "drawn", False),
     ("observations", "instance_fid", False),
     ("elements", "element_id", True),

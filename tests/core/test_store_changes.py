@@ -187,3 +187,58 @@ def test_a_place_that_very_many_looked_at_is_drawn_from_the_newest(store):
         rows = connection.execute("SELECT reason, COUNT(*) FROM left_out GROUP BY reason").fetchall()
     assert dict(rows) == {"enough other local maps looked there": 4 * 2 * 3}
     assert store.verify() == []
+
+
+def with_clock(local_maps, nanoseconds):
+    """Return a drive whose frames have other timestamps, or none."""
+    seen, looked = local_maps.observations.copy(), local_maps.instances.copy()
+    if nanoseconds is None:
+        return pm.LocalMaps(
+            seen.drop(columns="timestamp"), looked.drop(columns="timestamp_ns"), source=local_maps.source
+        )
+    number = seen["instance"].str.removeprefix("f").astype(int)
+    seen["timestamp"] = nanoseconds + number * 1_000_000_000
+    looked["timestamp_ns"] = nanoseconds + looked["instance"].str.removeprefix("f").astype(int) * 1_000_000_000
+    return pm.LocalMaps(seen, looked, source=local_maps.source)
+
+
+def renewals(store):
+    with store._opened() as (connection, _):
+        return connection.execute("SELECT class, kind, since_drive FROM renewed ORDER BY fid").fetchall()
+
+
+VANISHING = [ROAD, ROAD, ROAD, (ROAD[0], ROAD[2]), (ROAD[0], ROAD[2]), (ROAD[0], ROAD[2])]
+
+
+@pytest.mark.parametrize("clock", [None, 0], ids=["no clock", "clocks begin with each drive"])
+def test_without_a_common_clock_drives_are_in_the_order_in_which_the_map_was_told(store, clock):
+    for number, lines in enumerate(VANISHING):
+        store.update(with_clock(drive(number, *lines), clock))
+    assert heights(store.elements()) == pytest.approx([-4, 4], abs=0.3)
+    assert renewals(store) == [("divider", "vanished", "d3")]
+
+
+@pytest.mark.parametrize("clock", [None, 0], ids=["no clock", "clocks begin with each drive"])
+def test_nobody_knows_what_changed_between_drives_told_at_once_without_a_common_clock(store, clock):
+    store.update([with_clock(drive(number, *lines), clock) for number, lines in enumerate(VANISHING)])
+    assert renewals(store) == []
+
+
+def test_the_clock_tells_the_order_of_drives_told_the_other_way_round(store):
+    for number in reversed(range(6)):
+        store.update(drive(number, *VANISHING[number]))
+    assert heights(store.elements()) == pytest.approx([-4, 4], abs=0.3)
+    assert renewals(store) == [("divider", "vanished", "d3")]
+
+
+def test_where_drives_often_miss_a_line_two_that_do_are_not_enough(store):
+    """A predictor that loses lines for whole drives says little by losing one once more."""
+    flickering = (straight(-12), straight(-8), *ROAD, straight(8), straight(12))
+    for number in range(8):
+        seen = [line for at, line in enumerate(flickering) if (at + number) % 3]
+        store.update(drive(number, *seen))
+    always = [line for at, line in enumerate(flickering) if at != 3]
+    for number in (8, 9):
+        store.update(drive(number, *always))
+    assert renewals(store) == []
+    assert len(store.elements()) == 7
