@@ -10,8 +10,7 @@ from polymerge_core.io import read_layers, read_local_maps, write_layers
 from polymerge_core.merge import MergeResult, merge
 from polymerge_core.schema import LocalMaps
 from polymerge_core.store import MapStore, Update
-
-__version__ = "0.1.0"
+from polymerge_core.version import __version__
 
 __all__ = [
     "CrsError",
@@ -26,6 +25,7 @@ __all__ = [
     "SchemaError",
     "State",
     "Update",
+    "__version__",
     "accumulate",
     "evaluate",
     "merge",

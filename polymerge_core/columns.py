@@ -41,6 +41,11 @@ class Layer:
         return self.maps.observations
 
     @property
+    def saw_nothing(self) -> bool:
+        """Whether there are local maps, none of which saw anything."""
+        return self.data.empty and self.maps.instances is not None and len(self.maps.instances) > 0
+
+    @property
     def where(self) -> str:
         """The layer in words, for messages."""
         return f"{'main map' if self.is_main else 'layer'} {self.maps.source!r}"
@@ -76,7 +81,7 @@ def read_columns(layers: Sequence[Layer], options: Options) -> tuple[pd.DataFram
     features, attributes = [], []
     for number, layer in enumerate(layers):
         _check_layer(layer)
-        if layer.data.empty:
+        if layer.data.empty and not layer.saw_nothing:
             notes["warnings"].append(f"{layer.where} holds no features")
         table, used = _features(layer, options, several=count > 1, notes=notes)
         features.append(table.assign(layer=number))

@@ -52,13 +52,13 @@ def update(
     run = split_off(chosen)
     if stream == bool(local_maps):
         raise click.UsageError("give local maps, or --stream to read them from standard input")
-    if stream and run["watch_stdin"]:
-        raise click.UsageError("--watch-stdin does not go with --stream, which reads standard input")
-    made = crs if create else None
+    if stream:
+        _check_stream(run, chosen)
+    made = crs if create or stream else None
     with Job(None, local_maps, [], **run) as job:
         held = pm.MapStore(stored, create=create, crs=made, proximity=proximity, area=area, patience_s=patience)
         if stream:
-            report = run_stream(held, draw_every=draw_every)
+            report = run_stream(held, draw_every=draw_every, min_score=chosen["min_score"], strict=chosen["strict"])
         else:
             job.progress(0.0, "reading the files")
             layers = pm.read_local_maps(local_maps)
@@ -74,6 +74,18 @@ def update(
         f"{left_out(report['left_out'])}; {count(report['elements'], 'element')} ({what}) -> {stored}, "
         f"revision {report['revision']}"
     )
+    if report.get("unusable_lines"):
+        raise pm.InputError(f"{count(report['unusable_lines'], 'line')} could not be used; all others are in {stored}")
+
+
+def _check_stream(run: dict[str, Any], chosen: dict[str, Any]) -> None:
+    """Refuse what a stream has no use for."""
+    if run["watch_stdin"]:
+        raise click.UsageError("--watch-stdin does not go with --stream, which reads standard input")
+    usual = {"class_name": "line", "min_score": chosen["min_score"], "strict": chosen["strict"]}
+    unused = next((name for name, value in chosen.items() if value != usual.get(name)), None)
+    if unused is not None:
+        raise click.UsageError(f"--{unused.replace('_', '-')} does not go with --stream, whose frames have no columns")
 
 
 @click.command()

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import pyproj
 
 from polymerge_core.errors import InputError
-from polymerge_core.formats.assemble import Frame, assemble, class_of
+from polymerge_core.formats.assemble import Frame, assemble
 from polymerge_core.formats.poses import parse_poses
 from polymerge_core.formats.strict_json import number_array, parse_json, require, require_key
 from polymerge_core.formats.text import clean_name
@@ -61,7 +61,7 @@ def read_message(text: str, crs: pyproj.CRS, where: str) -> Message:
         raise InputError(
             f"{where}: {len(vectors)} vectors, {len(labels)} labels and {len(scores)} scores; give each one"
         )
-    names = [class_of(label, (), f"{where}, label {number}") for number, label in enumerate(labels)]
+    names = [_name_of(label, f"{where}, label {number}") for number, label in enumerate(labels)]
     predictions = assemble([Frame(instance, vectors, names, scores)], frame_kind="ego", source=drive, where=where)
     box = number_array(document.get("footprint", list(DEFAULT_FOOTPRINT)), f"{where}, footprint")
     if box.shape != (4,):
@@ -71,6 +71,12 @@ def read_message(text: str, crs: pyproj.CRS, where: str) -> Message:
         raise InputError(f"{where}, footprint: xmin must be below xmax, ymin below ymax")
     local = project(predictions, poses, crs=crs, footprint=(xmin, ymin, xmax, ymax), drive=drive)
     return Message(drive, instance, local)
+
+
+def _name_of(label: Any, where: str) -> str:
+    if not isinstance(label, str):
+        raise InputError(f"{where}: {label!r} is no text; the labels of a frame are names of classes")
+    return clean_name(label, where)
 
 
 def _name(document: dict[str, Any], key: str, where: str) -> str:

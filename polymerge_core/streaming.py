@@ -28,6 +28,7 @@ def run_stream(
     answer: Callable[[str], object] | None = None,
     *,
     draw_every: int,
+    **options: Any,
 ) -> dict[str, Any]:
     """Feed a map frames until there are no more.
 
@@ -39,19 +40,22 @@ def run_stream(
         One JSON object each, as `read_message` takes them; standard input by default.
     answer : callable, optional
         Called with a JSON object for each frame that is safe on the disk, ``{"drive", "instance", "revision"}``, or for
-        a line that cannot be used, ``{"line", "error"}``; prints it by default.
+        a line that cannot be used, ``{"line", "error"}``; prints it by default. A frame that the map knew already has
+        ``"known": true``, too, and one of which not all can be used ``"left_out"``, the reasons and their counts.
     draw_every : int
         How many frames the map may lag behind.
+    **options
+        Those of `MapStore.update` that say how a frame is read.
 
     Returns
     -------
     dict
-        What all updates did, ready for JSON.
+        What all updates did, ready for JSON; `unusable_lines` is how many lines could not be used.
 
     Raises
     ------
     InputError
-        At the end, if any line could not be used.
+        If there were no frames at all, or the map was not made because no line could be used.
     """
     reply, crs = answer or _print, store.crs
     total: dict[str, Any] = {}
@@ -65,7 +69,7 @@ def run_stream(
             continue
         try:
             message = read_message(line, crs, f"line {number}")
-            done = store.update(message.local_maps, draw=False)
+            done = store.update(message.local_maps, draw=False, **options)
         except (InputError, SchemaError, CrsError) as error:
             faults += 1
             say(f"error: {error}")
@@ -73,16 +77,20 @@ def run_stream(
             continue
         _add_up(total, done)
         waiting += 1
-        reply(json.dumps({"drive": message.drive, "instance": message.instance, "revision": done.revision}))
+        told: dict[str, Any] = {"drive": message.drive, "instance": message.instance, "revision": done.revision}
+        if done.skipped:
+            told["known"] = True
+        if done.left_out:
+            told["left_out"] = done.left_out
+        reply(json.dumps(told))
         if waiting >= draw_every:
             waiting = _draw(store, total)
     if waiting:
         _draw(store, total)
-    if faults:
-        raise InputError(f"{faults} of the lines could not be used; the others are in {store.path}")
-    if not total:
-        raise InputError("standard input held no frames; send one JSON object a line")
-    return total
+    if not number - faults or not total:
+        what = "no frames; send one JSON object a line" if not faults else "no line that could be used"
+        raise InputError(f"standard input held {what}; {store.path} is as it was")
+    return total | {"unusable_lines": faults}
 
 
 def _print(text: str) -> None:
@@ -105,6 +113,9 @@ def _add_up(total: dict[str, Any], done: Update) -> None:
             held = total.setdefault(name, {})
             for reason, count in value.items():
                 held[reason] = held.get(reason, 0) + count
+        elif name == "warnings":
+            # One for each frame would hide the others.
+            total[name] = list(dict.fromkeys([*total.get(name, []), *value]))
         else:
             total[name] = total[name] + value if name in total else value
 

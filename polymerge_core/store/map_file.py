@@ -50,7 +50,7 @@ class MapFile:
                 with contextlib.closing(self._connected()) as connection:
                     there = not is_empty(connection)
         if not there and not self._create:
-            raise InputError(f"{path} does not exist; a new map is made with create (--create)")
+            raise InputError(f"{path} does not exist; the first update makes a map, with create (update --create)")
         self._create = not there
         return there
 

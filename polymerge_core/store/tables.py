@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import sqlite3
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -16,6 +17,7 @@ from polymerge_core.environment import library_versions
 from polymerge_core.errors import InputError
 from polymerge_core.store import geopackage
 from polymerge_core.store.geopackage import create, create_layer, create_table
+from polymerge_core.version import __version__
 
 #: Of the tables; what a later one wrote is refused.
 FORMAT = 1
@@ -174,8 +176,8 @@ def read_settings(connection: sqlite3.Connection, path: Path) -> Settings:
     tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if "map_settings" not in tables:
         raise InputError(
-            f"{path} is no stored map: it has no table map_settings; make one with --create, or merge into this file "
-            "with --main-map"
+            f"{path} is no stored map: it has no table map_settings; name another file, which update --create makes a "
+            "map, or merge into this one with merge --main-map"
         )
     held = dict(connection.execute("SELECT name, value FROM map_settings").fetchall())
 
@@ -197,5 +199,5 @@ def read_settings(connection: sqlite3.Connection, path: Path) -> Settings:
 @cache
 def software() -> str:
     """Return who writes: this program and the libraries whose version matters."""
-    versions = library_versions()
+    versions = library_versions() | {"PolyMerge": __version__, "Python": platform.python_version()}
     return ", ".join(f"{name} {versions[name]}" for name in sorted(versions))

@@ -220,18 +220,17 @@ class TestStream:
         assert answers[1].keys() == {"line", "error"}
         assert answers[1]["line"] == 2
         assert said in answers[1]["error"]
-        # One line for the frame, one for the run.
-        assert len(outcome.err.splitlines()) == len(outcome.errors) == 2
-        assert outcome.errors[1] == (
-            f"error: 1 of the lines could not be used; the others are in {tmp_path / 'city.gpkg'}"
-        )
+        # One line for the frame, what was done with the others, one for the run.
+        assert len(outcome.err.splitlines()) == 3
+        assert outcome.err.splitlines()[1].startswith("2 observations of 2 local maps; 1 element (")
+        assert outcome.errors[1] == f"error: 1 line could not be used; all others are in {tmp_path / 'city.gpkg'}"
         assert look(tmp_path / "city.gpkg", "elements")["n_instances"].tolist() == [2]
 
     def test_numbers_lines_as_they_are_sent_empty_ones_too(self, stream, city):
         frames = lines_of(message(0), "", "no", "  ", message(1), "neither")
         outcome, answers = stream(frames, "update", city)
         assert [answer["line"] for answer in answers if "line" in answer] == [3, 6]
-        assert outcome.errors[-1].startswith("error: 2 of the lines")
+        assert outcome.errors[-1].startswith("error: 2 lines could not be used")
 
     def test_numbers_lines_rightly_where_they_come_slowly(self, city):
         def slowly():
@@ -242,8 +241,8 @@ class TestStream:
                 yield text
 
         answers = []
-        with pytest.raises(pm.InputError, match="2 of the lines"):
-            run_stream(pm.MapStore(city), slowly(), answers.append, draw_every=10)
+        total = run_stream(pm.MapStore(city), slowly(), answers.append, draw_every=10)
+        assert total["unusable_lines"] == 2
         assert [json.loads(each).get("line") for each in answers] == [1, None, 3]
 
     def test_draws_every_so_many_frames_and_at_the_end(self, city):
@@ -268,13 +267,61 @@ class TestStream:
         outcome, answers = stream(lines_of(nothing), "update", tmp_path / "city.gpkg", "--create", *CRS)
         assert outcome.code == 0, outcome.err
         assert answers[0]["instance"] == "f0"
+        assert outcome.warnings == []
 
     def test_answers_a_frame_that_is_sent_again(self, stream, city):
         outcome, answers = stream(lines_of(message(0), message(0)), "update", city)
         assert outcome.code == 0
         assert [answer["instance"] for answer in answers] == ["f0", "f0"]
+        assert [answer.get("known") for answer in answers] == [None, True]
         assert len(outcome.warnings) == 1
         assert "skipped" in outcome.warnings[0]
+
+    def test_answers_what_of_a_frame_cannot_be_used(self, stream, city):
+        lines = [[[-5, 0], [5, 0]], [[-5, 1], [5, 1]], [[0, 0]]]
+        odd = message(0) | {"vectors": lines, "labels": ["divider"] * 3, "scores": [0.9, 93, 0.9]}
+        outcome, answers = stream(lines_of(odd), "update", city)
+        assert outcome.code == 0
+        assert sum(answers[0]["left_out"].values()) == 2
+        assert "2 left out" in outcome.err
+
+    def test_is_strict_where_that_is_wanted(self, stream, city):
+        odd = message(0) | {"vectors": [[[-5, 0], [5, 0]], [[0, 0]]], "labels": ["divider"] * 2}
+        outcome, answers = stream(lines_of(odd, message(1)), "update", city, "--strict")
+        assert outcome.code == 1
+        assert [answer.keys() for answer in answers] == [{"line", "error"}, {"drive", "instance", "revision"}]
+
+    def test_leaves_out_what_is_under_the_least_score(self, stream, city):
+        _, answers = stream(lines_of(message(0, scores=[0.2])), "update", city, "--min-score", "0.5")
+        assert answers[0]["left_out"] == {"the score is under min_score (0.5)": 1}
+
+    def test_refuses_labels_that_are_numbers(self, stream, city):
+        _, answers = stream(lines_of(message(0, labels=[1]), message(1)), "update", city)
+        assert answers[0]["error"] == "line 1, label 0: 1 is no text; the labels of a frame are names of classes"
+
+    def test_refuses_a_crs_that_is_not_the_maps(self, stream, city):
+        before = city.read_bytes()
+        outcome, answers = stream(lines_of(message(0)), "update", city, "--crs", "EPSG:25833")
+        assert (outcome.code, answers) == (2, [])
+        assert "leave crs away" in outcome.errors[0]
+        assert city.read_bytes() == before
+
+    def test_refuses_options_of_columns(self, stream, city):
+        outcome, answers = stream(lines_of(message(0)), "update", city, "--class-field", "kind")
+        assert (outcome.code, answers) == (2, [])
+        assert "--class-field does not go with --stream" in outcome.errors[0]
+
+    def test_reports_although_a_line_cannot_be_used(self, stream, city, tmp_path):
+        outcome, _ = stream(lines_of(message(0), "no"), "update", city, "--json", tmp_path / "report.json")
+        assert outcome.code == 1
+        report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+        assert (report["instances"], report["unusable_lines"]) == (1, 1)
+
+    def test_makes_no_map_of_lines_that_cannot_be_used(self, stream, tmp_path):
+        outcome, answers = stream(lines_of("no"), "update", tmp_path / "city.gpkg", "--create", *CRS)
+        assert (outcome.code, len(answers)) == (1, 1)
+        assert outcome.errors[-1].startswith("error: standard input held no line that could be used")
+        assert list(tmp_path.iterdir()) == []
 
     def test_takes_matrices_scores_and_numbers_for_names(self, stream, city):
         pose = {"matrix": [[1, 0, 0, EAST + 50], [0, 1, 0, NORTH + 30], [0, 0, 1, 0], [0, 0, 0, 1]]}
