@@ -1,4 +1,4 @@
-"""The commands of the stored map: update, history, changes, restore, verify. No geometry here."""
+"""The commands of the stored map: update, history, changes, restore, undo, verify. No geometry here."""
 
 from __future__ import annotations
 
@@ -15,6 +15,14 @@ from polymerge_core.schema import AREAS_LAYER, ELEMENTS_LAYER, polygons_apart
 from polymerge_core.store.map_file import PATIENCE_S
 from polymerge_core.streaming import run_stream
 
+_patience = click.option(
+    "--patience",
+    type=click.FloatRange(0),
+    default=PATIENCE_S,
+    show_default=True,
+    help="Seconds to wait for another program that has MAP locked.",
+)
+
 
 @click.command()
 @click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
@@ -25,13 +33,7 @@ from polymerge_core.streaming import run_stream
 @source_options
 @click.option("--proximity", type=float, help="Of a map that is made: how near is near, in metres.  [default: 1]")
 @click.option("--area", multiple=True, metavar="CLASS", help="Of a map that is made: a class of areas; repeatable.")
-@click.option(
-    "--patience",
-    type=click.FloatRange(0),
-    default=PATIENCE_S,
-    show_default=True,
-    help="Seconds to wait for another program that has MAP locked.",
-)
+@_patience
 @click.option("--crs", callback=known_crs, help="CRS of a map that is made, and of layers without one.")
 @click.option("--strict", is_flag=True, help="A feature that cannot be used is an error.")
 @run_options
@@ -68,14 +70,18 @@ def update(
         job.report(report)
     for warning in report["warnings"]:
         console.say(f"warning: {warning}")
-    what = ", ".join(f"{report[kind]} {kind}" for kind in ("added", "changed", "moved", "retired", "merged"))
     console.say(
         f"{count(report['observations'], 'observation')} of {count(report['instances'], 'local map')}"
-        f"{left_out(report['left_out'])}; {count(report['elements'], 'element')} ({what}) -> {stored}, "
+        f"{left_out(report['left_out'])}; {_what_changed(report)} -> {stored}, "
         f"revision {report['revision']}"
     )
     if report.get("unusable_lines"):
         raise pm.InputError(f"{count(report['unusable_lines'], 'line')} could not be used; all others are in {stored}")
+
+
+def _what_changed(report: dict[str, Any]) -> str:
+    what = ", ".join(f"{report[kind]} {kind}" for kind in ("added", "changed", "moved", "retired", "merged"))
+    return f"{count(report['elements'], 'element')} ({what})"
 
 
 def _check_stream(run: dict[str, Any], chosen: dict[str, Any]) -> None:
@@ -134,6 +140,21 @@ def restore(stored: Path, output: Path, revision: int, **chosen: Any) -> None:
 
 @click.command()
 @click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
+@click.option("--revision", type=click.IntRange(1), required=True, help="Which one; history lists them.")
+@click.option("--until", type=click.IntRange(1), help="With it all from --revision to this one.")
+@_patience
+@click.option("--json", "report_file", metavar="FILE", help="Write a report as JSON; - for standard output.")
+def undo(stored: Path, revision: int, until: int | None, patience: float, report_file: str | None) -> None:
+    """Take back what came with a revision of the stored map MAP, as if it had never been told of it."""
+    with Job(None, [], [], overwrite=True, report_file=report_file, progress="none", watch_stdin=False) as job:
+        report = pm.MapStore(stored, patience_s=patience).undo(revision, until).report()
+        job.report(report)
+    which = str(revision) if until in (None, revision) else f"{revision} to {until}"
+    console.say(f"revision {which} taken back; {_what_changed(report)} -> {stored}, revision {report['revision']}")
+
+
+@click.command()
+@click.argument("stored", metavar="MAP", type=click.Path(path_type=Path))
 def verify(stored: Path) -> None:
     """Check that everything that must hold of the file of the stored map MAP does."""
     found = pm.MapStore(stored).verify()
@@ -142,4 +163,4 @@ def verify(stored: Path) -> None:
     console.say(f"{stored} is whole")
 
 
-COMMANDS = (update, history, changes, restore, verify)
+COMMANDS = (update, history, changes, restore, undo, verify)

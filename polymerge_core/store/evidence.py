@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from polymerge_core.columns import NO_TIMESTAMP
+from polymerge_core.consensus.alongside import REACH
 from polymerge_core.consensus.instances import known_instances
 from polymerge_core.crs import crs_name
 from polymerge_core.curves import Array, Curves, Index
@@ -207,6 +208,30 @@ def add(connection: sqlite3.Connection, settings: Settings, evidence: Evidence, 
     return instance_fid, observation_fid
 
 
+def place_of(
+    connection: sqlite3.Connection, settings: Settings, which: str, values: Sequence[Any] = ()
+) -> BaseGeometry:
+    """Return what some local maps may say anything of: what they looked at, and what they saw.
+
+    Parameters
+    ----------
+    connection : sqlite3.Connection
+        Of a stored map.
+    settings : Settings
+        Of the map.
+    which : str
+        SQL that chooses local maps, ``i``.
+    values : sequence
+        Of the marks in it.
+    """
+    looked = f"SELECT geom FROM instances i WHERE {which} AND has_footprint ORDER BY fid"
+    seen = f"SELECT o.geom FROM observations o JOIN instances i ON i.fid = o.instance_fid WHERE {which} ORDER BY o.fid"
+    areas, lines = (
+        geopackage.from_blobs([row[0] for row in connection.execute(query, values)]) for query in (looked, seen)
+    )
+    return shapely.union_all(np.concatenate([areas, shapely.buffer(lines, REACH * settings.proximity, quad_segs=2)]))
+
+
 class Context(NamedTuple):
     """All that is known of a place.
 
@@ -260,6 +285,8 @@ def _heard(instances: gpd.GeoDataFrame, drives: pd.DataFrame, unit: float) -> ND
 
     The lot is the same at all times, so that a place is drawn from the same frames whoever draws it.
     """
+    if instances.empty:
+        return np.empty(0, dtype=bool)
     drive = order_drives(instances, drives).drive
     middle = np.floor(shapely.get_coordinates(shapely.centroid(instances.geometry.to_numpy())) / (_SQUARE * unit))
     lot = pd.util.hash_pandas_object(instances["drive"] + "\n" + instances["instance"], index=False).to_numpy()

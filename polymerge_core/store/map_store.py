@@ -16,25 +16,21 @@ import numpy as np
 import pandas as pd
 import pyproj
 import shapely
-from shapely.geometry.base import BaseGeometry
 
-from polymerge_core.consensus.alongside import REACH
 from polymerge_core.crs import is_local, is_metric, parse_crs
 from polymerge_core.errors import CrsError, InputError, OptionError
 from polymerge_core.options import Options
 from polymerge_core.sets import Input, as_local_maps
 from polymerge_core.store import geopackage
 from polymerge_core.store.element_table import Counts, read_elements
-from polymerge_core.store.evidence import Evidence, add, read_evidence, without_known
+from polymerge_core.store.evidence import Evidence, add, place_of, read_evidence, without_known
 from polymerge_core.store.geopackage import Connection, is_empty
 from polymerge_core.store.map_file import PATIENCE_S, MapFile
 from polymerge_core.store.past import arrows, changes_since, elements_at
 from polymerge_core.store.redraw import redraw
 from polymerge_core.store.tables import Settings, create_map, read_settings, software
+from polymerge_core.store.undo import TakenOut, take_out
 from polymerge_core.store.verify import faults
-
-#: What a footprint or an observation is wider by than what it says of the map, proximities.
-_AROUND = REACH
 
 
 @dataclass(frozen=True)
@@ -93,6 +89,7 @@ class Update:
 
 
 _NO_CHANGE = Counts()
+_NOTHING = TakenOut(shapely.Polygon(), np.empty(0, np.intp))
 
 
 class MapStore:
@@ -245,6 +242,50 @@ class MapStore:
                 return None
             return self._commit(connection, settings, None, "", 0, draw=True)
 
+    def undo(self, revision: int, until: int | None = None) -> Update:
+        """Take back what came with a revision, as if the map had never been told of it.
+
+        Its local maps are taken out of the file, and what they looked at is drawn anew from all others. That is a
+        revision, too; the history stays. The same local maps may come again.
+
+        Parameters
+        ----------
+        revision : int
+            Of `history`; one that brought local maps.
+        until : int, optional
+            With it all revisions from `revision` to this one, such as the frames of a stream.
+
+        Returns
+        -------
+        Update
+            The new revision, and what changed.
+
+        Raises
+        ------
+        OptionError
+            If there is no such revision, or nothing that can be taken back.
+        OutputError
+            If the map cannot be written; it is as it was then.
+        """
+        self._check_there()
+        last = revision if until is None else until
+        with self._file.writing() as connection:
+            settings = read_settings(connection, self.path)
+            for each in (revision, last):
+                self._check_revision(connection, each)
+            brought = "number BETWEEN ? AND ? AND n_instances > 0 AND undone IS NULL"
+            query = f"SELECT COUNT(*) FROM revisions WHERE {brought}"
+            if not connection.execute(query, (revision, last)).fetchone()[0]:
+                raise OptionError(
+                    f"there is nothing in revision {_span(revision, last)} of {self.path} that can be taken back: it "
+                    "brought no local maps, or they were taken back already"
+                )
+            out = take_out(connection, settings, revision, last)
+            source = f"undo of revision {_span(revision, last)}"
+            done = self._commit(connection, settings, None, source, 0, draw=True, out=out)
+            connection.execute(f"UPDATE revisions SET undone = ? WHERE {brought}", (done.revision, revision, last))
+            return done
+
     def elements(self, revision: int | None = None) -> gpd.GeoDataFrame:
         """Return the map as it is, or as it was at a revision.
 
@@ -339,16 +380,17 @@ class MapStore:
         skipped: int,
         *,
         draw: bool,
+        out: TakenOut = _NOTHING,
     ) -> Update:
-        """Make a revision: of what is new, of drawing, or of both."""
+        """Make a revision: of what is new, of what was taken out, of drawing."""
         revision = geopackage.next_id(connection, "revisions")
         if evidence is not None:
             add(connection, settings, evidence, revision)
         counts = _NO_CHANGE
         if draw:
-            place = waiting(connection, settings)
+            place = shapely.union_all([out.place, place_of(connection, settings, "i.drawn IS NULL")])
             if not place.is_empty:
-                counts = redraw(connection, settings, place, revision)
+                counts = redraw(connection, settings, place, revision, out.elements)
             connection.execute("UPDATE instances SET drawn = ? WHERE drawn IS NULL", (revision,))
         update = Update.of(revision, counts, _count(connection, "elements"), skipped, evidence)
         row = {
@@ -403,15 +445,8 @@ _READING = {
 }
 
 
-def waiting(connection: sqlite3.Connection, settings: Settings) -> BaseGeometry:
-    """Return what the local maps that wait to be drawn may say anything of: what they looked at, and what they saw."""
-    looked = "SELECT geom FROM instances WHERE drawn IS NULL AND has_footprint ORDER BY fid"
-    seen = (
-        "SELECT o.geom FROM observations o JOIN instances i ON i.fid = o.instance_fid WHERE i.drawn IS NULL "
-        "ORDER BY o.fid"
-    )
-    areas, lines = (geopackage.from_blobs([row[0] for row in connection.execute(query)]) for query in (looked, seen))
-    return shapely.union_all(np.concatenate([areas, shapely.buffer(lines, _AROUND * settings.proximity, quad_segs=2)]))
+def _span(first: int, last: int) -> str:
+    return str(first) if first == last else f"{first} to {last}"
 
 
 def _count(connection: sqlite3.Connection, table: str) -> int:

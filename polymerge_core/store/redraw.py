@@ -17,6 +17,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from polymerge_core.consensus.alongside import REACH
+from polymerge_core.curves import Index
 from polymerge_core.schema import NO_ELEMENT
 from polymerge_core.store import geopackage
 from polymerge_core.store.beliefs import Renewal, judge_elements
@@ -36,7 +37,13 @@ _AS_IT_WAS = 0.25
 _RENEWALS = 2
 
 
-def redraw(connection: sqlite3.Connection, settings: Settings, place: BaseGeometry, revision: int) -> Counts:
+def redraw(
+    connection: sqlite3.Connection,
+    settings: Settings,
+    place: BaseGeometry,
+    revision: int,
+    affected: Index,
+) -> Counts:
     """Draw a place anew, and write what changed.
 
     Parameters
@@ -49,6 +56,8 @@ def redraw(connection: sqlite3.Connection, settings: Settings, place: BaseGeomet
         Metres, in the map's CRS.
     revision : int
         What is written becomes part of it.
+    affected : ndarray of int
+        Ids of elements that count other observations than before, wherever they lie.
 
     Returns
     -------
@@ -70,7 +79,7 @@ def redraw(connection: sqlite3.Connection, settings: Settings, place: BaseGeomet
     share_out(connection, shapes, ids, stored)
     drawn = as_table(shapes, ids, merged.elements, stored, settings)
     # What is seen beyond the place may have gone over to what is drawn inside of it, or come from there.
-    others = np.setdiff1d(before["element_id"], [*ids, *stored.index])
+    others = np.setdiff1d([*before["element_id"], *affected], [*ids, *stored.index])
     beyond = read_elements(connection, settings, others)
     now, was = pd.concat([drawn, beyond]), pd.concat([stored, beyond])
     count_looks(connection, now)

@@ -117,6 +117,8 @@ _TABLES = {
             "merged": "INTEGER",
             "elements": "INTEGER",
             "software": "TEXT",
+            # The revision that took back what came with this one, NULL as long as it is there.
+            "undone": "INTEGER",
         },
     ),
     "map_settings": ("fid", {"name": "TEXT", "value": "TEXT"}),

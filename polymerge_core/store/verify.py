@@ -40,7 +40,8 @@ _QUESTIONS = {
     "local maps are of no revision": ("SELECT fid FROM instances WHERE revision NOT IN (SELECT number FROM revisions)"),
     "changes are of no revision": "SELECT fid FROM changes WHERE revision NOT IN (SELECT number FROM revisions)",
     "revisions count other local maps than there are": (
-        "SELECT number FROM revisions WHERE n_instances != (SELECT COUNT(*) FROM instances WHERE revision = number)"
+        "SELECT number FROM revisions WHERE CASE WHEN undone IS NULL THEN n_instances ELSE 0 END != "
+        "(SELECT COUNT(*) FROM instances WHERE revision = number)"
     ),
     "local maps count other observations than there are": (
         "SELECT fid FROM instances WHERE n_observations != "

@@ -670,6 +670,73 @@ class TestVerifying:
         assert fed.verify() == []
 
 
+class TestUndo:
+    def test_takes_a_local_map_back_as_if_it_had_never_come(self, tmp_path):
+        """What remains is what the others alone draw, wherever they looked."""
+        frames = [
+            frame(0, level(0, 0, 100), level(10, 0, 100)),
+            frame(1, level(0.3, 0, 100), level(10.2, 0, 100)),
+            frame(2, level(0.6, 0, 100), level(40, 0, 100), around=box(-5, -10, 105, 50)),
+        ]
+        fed, without = (pm.MapStore(tmp_path / name, create=True, crs=LOCAL_CRS) for name in ("all.gpkg", "some.gpkg"))
+        for each in frames:
+            fed.update(each)
+        for each in (frames[0], frames[1]):
+            without.update(each)
+        done = fed.undo(3)
+        assert (done.revision, done.retired) == (4, 1)
+        for name in ("n_observations", "n_instances", "class", "state"):
+            assert fed.elements()[name].tolist() == without.elements()[name].tolist()
+        one, other = fed.elements().geometry, without.elements().geometry
+        assert shapely.hausdorff_distance(one.to_numpy(), other.to_numpy()).max() < 1e-6
+        assert fed.verify() == []
+        history = fed.history()
+        assert history["source"].iloc[-1] == "undo of revision 3"
+        assert history["undone"].fillna(0).tolist() == [0, 0, 4, 0]
+
+    def test_leaves_the_history_and_lets_it_come_again(self, store):
+        for number in range(2):
+            store.update(frame(number, level(0.2 * number, 0, 100), level(10, 0, 100)))
+        before = [store.elements(number) for number in (1, 2)]
+        store.undo(2)
+        for number, elements in enumerate(before, 1):
+            pd.testing.assert_frame_equal(pd.DataFrame(store.elements(number)), pd.DataFrame(elements))
+        pd.testing.assert_frame_equal(
+            pd.DataFrame(store.elements()).drop(columns="evidence"), pd.DataFrame(before[0]).drop(columns="evidence")
+        )
+        assert store.update(frame(1, level(0.2, 0, 100), level(10, 0, 100))).skipped == 0
+        again = store.elements()
+        assert shapely.hausdorff_distance(again.geometry.to_numpy(), before[1].geometry.to_numpy()).max() < 1e-6
+        assert store.verify() == []
+
+    def test_of_all_leaves_an_empty_map(self, store):
+        for number in range(3):
+            store.update(frame(number, level(0, 0, 100)), draw=number == 1)
+        done = store.undo(1, 3)
+        assert (done.elements, len(store.elements())) == (0, 0)
+        assert store.draw() is None
+        assert store.verify() == []
+
+    def test_draws_what_waits(self, store):
+        store.update(frame(0, level(0, 0, 100)))
+        store.update(frame(1, level(20, 0, 100)), draw=False)
+        store.undo(1)
+        assert [round(shape.centroid.y) for shape in store.elements().geometry] == [20]
+        assert store.verify() == []
+
+    def test_says_so_where_there_is_nothing_to_take_back(self, store):
+        store.update(frame(0, level(0, 0, 100)), draw=False)
+        store.draw()
+        with pytest.raises(pm.OptionError, match="no revision 7; it has 1 to 2"):
+            store.undo(7)
+        with pytest.raises(pm.OptionError, match="brought no local maps"):
+            store.undo(2)
+        store.undo(1)
+        with pytest.raises(pm.OptionError, match="taken back already"):
+            store.undo(1)
+        assert store.verify() == []
+
+
 class TestFailing:
     @pytest.fixture
     def broken(self, monkeypatch):
@@ -686,7 +753,7 @@ class TestFailing:
     STEPS = (
         "polymerge_core.store.map_store.read_evidence",
         "polymerge_core.store.map_store.add",
-        "polymerge_core.store.map_store.waiting",
+        "polymerge_core.store.map_store.place_of",
         "polymerge_core.store.merging.merge",
         "polymerge_core.store.shapes.put_together",
         "polymerge_core.store.redraw.count_looks",

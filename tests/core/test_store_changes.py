@@ -242,3 +242,15 @@ def test_where_drives_often_miss_a_line_two_that_do_are_not_enough(store):
         store.update(drive(number, *always))
     assert renewals(store) == []
     assert len(store.elements()) == 7
+
+
+def test_undoing_the_drives_that_saw_a_line_vanish_brings_it_back(store):
+    for number in range(3):
+        store.update(drive(number, *ROAD))
+    for number in (3, 4):
+        store.update(drive(number, ROAD[0], ROAD[2]))
+    assert heights(store.elements()) == pytest.approx([-4, 4], abs=0.3)
+    store.undo(4, 5)
+    assert heights(store.elements()) == pytest.approx([-4, 0, 4], abs=0.3)
+    assert renewals(store) == []
+    assert store.verify() == []
