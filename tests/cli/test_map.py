@@ -401,6 +401,33 @@ class TestChanges:
         assert list(tmp_path.iterdir()) == []
 
 
+class TestUndo:
+    def test_takes_back_what_came_with_a_revision(self, run, city):
+        before = look(city, "elements")
+        outcome = run("undo", city, "--revision", 2, "--json", "-")
+        assert outcome.code == 0, outcome.err
+        assert outcome.err.startswith("revision 2 taken back; 2 elements (")
+        assert json.loads(outcome.out)["revision"] == 3
+        assert before["n_instances"].max() == 2
+        assert look(city, "elements")["n_instances"].tolist() == [1, 1]
+        assert "undo of revision 2" in run("history", city).out
+        assert pm.MapStore(city).verify() == []
+
+    def test_takes_back_several_at_once(self, run, city):
+        outcome = run("undo", city, "--revision", 1, "--until", 2)
+        assert outcome.code == 0, outcome.err
+        assert outcome.err.startswith("revision 1 to 2 taken back; 0 elements (")
+
+    @pytest.mark.parametrize(("revision", "said"), [(9, "no revision 9"), (2, "taken back already")])
+    def test_refuses_what_cannot_be_taken_back(self, run, city, revision, said):
+        run("undo", city, "--revision", 2)
+        before = city.read_bytes()
+        outcome = run("undo", city, "--revision", revision)
+        assert outcome.code == 2
+        assert said in outcome.errors[0]
+        assert city.read_bytes() == before
+
+
 class TestRestore:
     @pytest.mark.parametrize("name", ["old.gpkg", "old.geojson", "old.parquet", "old.fgb"])
     def test_writes_the_map_as_it_was(self, run, made, tmp_path, name):
