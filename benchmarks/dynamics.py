@@ -1,10 +1,12 @@
-"""How well a stored map follows the road: changes found, false ones, and the error after ever more drives.
+"""How well a stored map follows the road: changes found, false ones, the error after ever more drives, frame by frame.
 
-    python benchmarks/dynamics.py --data FOLDER
+    python benchmarks/dynamics.py --data FOLDER [--only PART ...] [-o dynamics.json]
 
-Drives are simulated on real roads (Argoverse 2; without FOLDER through the simulated town). After the second drive
-dividers vanish, a boundary moves by 1.5 m, a divider is painted 0.8 m aside, and a crossing and a divider appear. The
-real drives of `deecamp` are fed one after another.
+Drives are simulated on real roads (Argoverse 2; without FOLDER through the simulated town). ``changes``: after the
+second drive dividers vanish, a boundary moves by 1.5 m, a divider is painted 0.8 m aside, and a crossing and a divider
+appear. ``errors``: how far the map is off after 1, 2, 4 and 8 drives. ``unchanged``: what is taken for a change on a
+road that stays as it is. ``frames``: a map that was fed one frame at a time beside one merge of all. ``real``: the real
+drives of `deecamp`, one after another.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import polymerge_core as pm
 from benchmarks.noise import Noise
 from benchmarks.scenarios import MIAMI, PITTSBURGH, Road, Scenario, av2_road, deecamp, town_road
+from polymerge_core.observations import as_lines
 
 #: The road changes after so many drives, and is looked at after so many.
 CHANGED_AFTER, LOOKED_AT, DRIVES = 2, 5, 8
@@ -40,6 +43,11 @@ BOUNDARY_M, DIVIDER_M = 1.5, 0.8
 
 #: A change counts as found where what was found lies along half of it, no farther away than this, metres.
 _NEAR = 2.5
+
+#: The error is looked at after so many drives, of these classes.
+STAGES, LINES = (1, 2, 4, 8), ("divider", "boundary")
+
+PARTS = ("changes", "errors", "unchanged", "frames", "real")
 
 _DAY_NS = 86_400_000_000_000
 
@@ -100,11 +108,9 @@ def changed_road(road: Road, seed: int, seen: shapely.Geometry) -> tuple[Road, R
 
 
 def _aside(line: shapely.Geometry, by: float) -> shapely.Geometry:
-    """Move a line sideways as a whole: across the direction from its one end to the other."""
-    points = shapely.get_coordinates(line)
-    along = points[-1] - points[0] if np.any(points[-1] != points[0]) else np.array([1.0, 0.0])
-    normal = np.array([-along[1], along[0]]) / np.hypot(*along)
-    return shapely.transform(line, lambda xy: xy + by * normal)
+    """Move a line sideways: every stretch of it to the left by as much."""
+    parts = shapely.get_parts(shapely.line_merge(shapely.offset_curve(line, by, join_style="mitre")))
+    return parts[np.argmax(shapely.length(parts))]
 
 
 def drives(road: Road, later: Road, seed: int, noise: Noise | None, count: int) -> list[Scenario]:
@@ -161,36 +167,91 @@ def follow(road: Road, seed: int, noise: Noise | None, folder: Path) -> dict[str
     }
 
 
-def unchanged(road: Road, seed: int, count: int, folder: Path) -> dict[str, Any]:
-    """Feed a map drives on a road that stays as it is; count what it takes for changes, and its error."""
-    store = pm.MapStore(folder / f"unchanged_{seed}.gpkg", create=True)
-    errors, retired = [], 0
-    for number, drive in enumerate(drives(road, road, seed, None, count), 1):
-        sure = set(store.elements().query("state == 'confirmed'")["element_id"]) if number > 1 else set()
-        done = store.update(drive.local)
-        now = store.changes(done.revision - 1) if number > 1 else None
-        if now is not None:
-            retired += int((now["element_id"].isin(sure) & (now["kind"] == "retired")).sum())
-        if number in (1, 2, 4, 8):
+def errors(road: Road, seed: int, folder: Path) -> list[dict[str, float]]:
+    """Feed a map drives on a road that stays as it is; return its error after some of them."""
+    store = pm.MapStore(folder / f"errors_{seed}.gpkg", create=True)
+    found = []
+    for number, drive in enumerate(drives(road, road, seed, None, DRIVES), 1):
+        store.update(drive.local)
+        if number in STAGES:
             result = pm.evaluate(store.elements(), road.truth, local_maps=drive.local)
-            errors.append({name: result.value(name, "lateral_median") for name in ("divider", "boundary")})
+            found.append({name: result.value(name, "lateral_median") for name in LINES})
+    return found
+
+
+def unchanged(road: Road, seed: int, count: int, folder: Path) -> dict[str, Any]:
+    """Feed a map drives on a road that stays as it is; count what it takes for changes, and what it loses."""
+    store = pm.MapStore(folder / f"unchanged_{seed}.gpkg", create=True)
+    lost = dict.fromkeys(("retired", "merged"), 0)
+    for number, drive in enumerate(drives(road, road, seed, None, count)):
+        sure = set(store.elements().query("state == 'confirmed'")["element_id"]) if number else set()
+        done = store.update(drive.local)
+        if number:
+            now = store.changes(done.revision - 1)
+            for kind in lost:
+                lost[kind] += int((now["element_id"].isin(sure) & (now["kind"] == kind)).sum())
     kinds = renewals(store.path)["kind"].value_counts().to_dict()
-    return {"errors": errors, "retired": retired, "taken for changes": kinds}
+    return {"confirmed elements lost": lost, "taken for changes": kinds, "elements": len(store.elements())}
+
+
+def apart(one: gpd.GeoDataFrame, other: gpd.GeoDataFrame) -> dict[str, float]:
+    """Return how many elements two maps have, and how far points along either are from the class in the other."""
+    found = []
+    for left, right in ((one, other), (other, one)):
+        for cls, own in left.groupby("class"):
+            there = shapely.multilinestrings(as_lines(right.geometry[right["class"] == cls].to_numpy()))
+            points = [
+                shapely.line_interpolate_point(line, np.arange(0.5, line.length, 1.0))
+                for line in as_lines(own.geometry.to_numpy())
+            ]
+            found.append(shapely.distance(there, np.concatenate(points)))
+    every = np.nan_to_num(np.concatenate(found), nan=np.inf)
+    counts = {"one by one": len(one), "at once": len(other)}
+    return counts | {"median": float(np.median(every)), "p95": float(np.quantile(every, 0.95))}
+
+
+def one_by_one(local: list[pm.LocalMaps], folder: Path, draw_every: int) -> dict[str, float]:
+    """Feed a map frame by frame, drawing every so many, and merge all of them at once; compare the two maps."""
+    path = folder / "frames.gpkg"
+    path.unlink(missing_ok=True)
+    store = pm.MapStore(path, create=True)
+    waiting = 0
+    for maps in local:
+        for row in range(len(maps.instances)):
+            instance = maps.instances.iloc[[row]]
+            own = maps.observations["instance"] == instance["instance"].iloc[0]
+            waiting += 1
+            store.update(
+                replace(maps, observations=maps.observations[own], instances=instance, left_out=None),
+                draw=waiting % draw_every == 0,
+            )
+    store.draw()
+    return apart(store.elements(), pm.merge(local).elements)
 
 
 def real(data: Path, folder: Path) -> list[dict[str, float]]:
-    """Feed a map the real drives one after another; return its error after some."""
+    """Feed a map the real drives one after another; return its error after some, and that of each drive by itself."""
     scenario = deecamp(data)
     store = pm.MapStore(folder / "deecamp.gpkg", create=True)
     found = []
+
+    def error(held: pm.MapStore, local: list[pm.LocalMaps]) -> float:
+        result = pm.evaluate(held.elements(), scenario.truth, local_maps=local, crs="local")
+        return float(result.value("divider", "lateral_median"))
+
+    alone = []
+    for number, local in enumerate(scenario.local):
+        single = pm.MapStore(folder / f"alone_{number}.gpkg", create=True)
+        single.update(local)
+        alone.append(error(single, [local]))
+    found.append({"drives": 1, "lateral_median": float(np.mean(alone)), "least": min(alone), "most": max(alone)})
     for number, local in enumerate(scenario.local, 1):
         start = time.perf_counter()
         store.update(local)
         took = time.perf_counter() - start
-        if number in (1, 2, 4, 8, 14):
-            result = pm.evaluate(store.elements(), scenario.truth, local_maps=scenario.local[:number], crs="local")
-            error = result.value("divider", "lateral_median")
-            found.append({"drives": number, "lateral_median": error, "elements": len(store.elements()), "s": took})
+        if number in (*STAGES, len(scenario.local)):
+            off = error(store, scenario.local[:number])
+            found.append({"drives": number, "lateral_median": off, "elements": len(store.elements()), "s": took})
     return found
 
 
@@ -200,9 +261,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder of the real data")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--unchanged", type=int, default=50, help="drives over a road that stays as it is")
-    parser.add_argument(
-        "--only", choices=["changes", "unchanged", "real"], nargs="+", default=["changes", "unchanged", "real"]
-    )
+    parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS)
+    parser.add_argument("--draw-every", type=int, default=100, help="of the real frames one by one")
     parser.add_argument("-o", "--output", type=Path, help="JSON file for the figures")
     options = parser.parse_args()
     roads = {"town": town_road()}
@@ -212,6 +272,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         if "changes" in options.only:
             figures["changes"] = _changes(roads, options.seeds, Path(name))
+        if "errors" in options.only:
+            figures["errors"] = _errors(roads, options.seeds, Path(name))
+        if "frames" in options.only:
+            figures["frames"] = _frames(roads, options, Path(name))
         if "unchanged" in options.only:
             for road, held in roads.items():
                 figures[f"unchanged {road}"] = told = unchanged(held, 7, options.unchanged, Path(name))
@@ -221,6 +285,38 @@ def main() -> None:
             print(pd.DataFrame(figures["real"]).round(3).to_string(index=False), flush=True)
     if options.output:
         options.output.write_text(json.dumps(figures, indent=2, default=str) + "\n", encoding="utf-8")
+
+
+def _errors(roads: dict[str, Road], seeds: int, folder: Path) -> dict[str, Any]:
+    """Print the error after some drives, in the mean over seeds, and beside that after the first."""
+    figures = {}
+    for name, road in roads.items():
+        every = [errors(road, seed, folder) for seed in range(seeds)]
+        for cls in LINES:
+            mean = np.mean([[stage[cls] for stage in told] for told in every], axis=0)
+            figures[f"{name}, {cls}"] = mean.tolist()
+            told = ", ".join(f"{value:.3f}" for value in mean)
+            print(f"{name}, {cls}, {seeds} seeds, after {STAGES} drives: {told} ({mean[-1] / mean[0]:.2f})", flush=True)
+        for seed in range(seeds):
+            (folder / f"errors_{seed}.gpkg").unlink()
+    return figures
+
+
+def _frames(roads: dict[str, Road], options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    figures = {}
+    for name, road in roads.items():
+        for seed in range(options.seeds):
+            (drive,) = road.drive("drive 0", seed=seed, noise=None).local
+            figures[f"{name}, {seed}"] = told = one_by_one([drive], folder, 1)
+            print(f"{name}, seed {seed}, one frame at a time: {_rounded(told)}", flush=True)
+    if options.data:
+        figures["deecamp"] = told = one_by_one(deecamp(options.data).local, folder, options.draw_every)
+        print(f"deecamp, one frame at a time, drawn every {options.draw_every}: {_rounded(told)}", flush=True)
+    return figures
+
+
+def _rounded(told: dict[str, float]) -> dict[str, float]:
+    return {name: round(value, 3) for name, value in told.items()}
 
 
 def _changes(roads: dict[str, Road], seeds: int, folder: Path) -> dict[str, Any]:

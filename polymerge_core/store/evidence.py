@@ -31,7 +31,7 @@ from polymerge_core.store.tables import Settings
 _NAMES = ["drive", "instance"]
 
 #: Where very many looked, so many drives are heard in a square of so many proximities, and so many frames of each.
-_DRIVES, _FRAMES, _SQUARE = 16, 16, 30.0
+_DRIVES, _FRAMES, _SQUARE = 16, 64, 30.0
 
 
 class Evidence(NamedTuple):
