@@ -61,6 +61,9 @@ _BRIDGED = 6.0
 #: Whether a line lies elsewhere is judged over so many proximities.
 _WINDOW = 40.0
 
+#: By how much a drive is off as a whole is told for squares of so many proximities.
+_LOCAL = 100.0
+
 #: Drives are taken to be at least this far apart in what they say of a line, proximities.
 _LEAST = 0.1
 
@@ -298,7 +301,7 @@ def _moved(
     within = aside[beside] - offset.ravel()[cell]
     cls = elements["class"].to_numpy()[places.element]
     of_drive, of_looks = _variance(offset, many, within, cell // drives, cls, unit)
-    offset = _without_shift(offset, of_drive + of_looks, places.normal)
+    offset = _without_shift(offset, of_drive + of_looks, places, unit)
 
     half = int(_WINDOW / _STEP / 2)
     every = np.arange(len(places.points))
@@ -356,25 +359,33 @@ def _steps(offset: Array, variance: Array, unit: float) -> Array:
     return gain
 
 
-def _without_shift(offset: Array, variance: Array, normal: Array) -> Array:
-    """Take away what a drive is off as a whole: the shift that its lines say together, robustly."""
-    known = np.isfinite(offset).any(axis=1, keepdims=True)
-    centred = offset - np.nanmedian(np.where(known, offset, 0.0), axis=1, keepdims=True)
-    for column in range(offset.shape[1]):
-        rows = np.flatnonzero(np.isfinite(centred[:, column]))
-        if len(rows) < 3:
-            continue
-        deviation = np.sqrt(variance[rows, column])
-        across, said = normal[rows] / deviation[:, None], centred[rows, column] / deviation
-        weight = np.ones(len(rows))
-        shift = np.zeros(2)
-        for _ in range(10):
-            held = across * weight[:, None]
-            shift = np.linalg.solve(held.T @ across + np.eye(2), held.T @ said)
-            # Cauchy's weights: what moved does not count.
-            weight = 1 / (1 + ((said - across @ shift) / HALF_WEIGHT) ** 2)
-        offset[rows, column] -= normal[rows] @ shift
-    return offset
+def _without_shift(offset: Array, variance: Array, places: Places, unit: float) -> Array:
+    """Take away what a drive is off in each square as a whole: the shift that its lines there say together, robustly.
+
+    What all lines share is the vehicle's position, which drifts along its way.
+    """
+    known = np.isfinite(offset)
+    usual = np.nanmedian(np.where(known.any(axis=1, keepdims=True), offset, 0.0), axis=1, keepdims=True)
+    row, column = np.nonzero(known)
+    _, square = np.unique(np.floor(places.points / (_LOCAL * unit)), axis=0, return_inverse=True)
+    _, group = np.unique(square.ravel()[row] * offset.shape[1] + column, return_inverse=True)
+    deviation = np.sqrt(variance[row, column])
+    across = places.normal[row] / deviation[:, None]
+    said = (offset - usual)[row, column] / deviation
+    weight = np.ones(len(row))
+    for _ in range(10):
+        products = (weight[:, None] * across)[:, :, None] * np.column_stack([across, said])[:, None, :]
+        sums = np.zeros((group.max(initial=-1) + 1, 2, 3))
+        np.add.at(sums, group, products)
+        matrix, wanted = sums[:, :, :2] + np.eye(2), sums[:, :, 2]
+        shift = np.linalg.solve(matrix, wanted[:, :, None])[:, :, 0]
+        # Cauchy's weights: what moved does not count.
+        weight = 1 / (1 + ((said - (across * shift[group]).sum(axis=1)) / HALF_WEIGHT) ** 2)
+    # Two places say what two numbers are.
+    shift[np.bincount(group) < 3] = 0.0
+    moved = offset.copy()
+    moved[row, column] -= (places.normal[row] * shift[group]).sum(axis=1)
+    return moved
 
 
 def _variance(
@@ -387,10 +398,10 @@ def _variance(
         rows = cls == name
         single = rows[place] & (within != 0)
         look = (MAD * float(np.median(np.abs(within[single])))) ** 2 if single.any() else (0.3 * unit) ** 2
-        # From one drive to the next: where the road changes but one of these is large.
-        step = np.diff(offset[rows], axis=1)
-        known = np.isfinite(step)
-        own = (MAD * float(np.median(np.abs(step[known])))) ** 2 / 2 if known.any() else least
+        # From one drive to the next; where the road changes between two of them their difference is large.
+        steps = [step[np.isfinite(step)] for step in np.diff(offset[rows], axis=1).T]
+        spread = [(MAD * float(np.median(np.abs(step)))) ** 2 for step in steps if len(step)]
+        own = float(np.median(spread)) / 2 if spread else least
         usual = float(np.mean(1.0 / many[rows][many[rows] > 0])) if (many[rows] > 0).any() else 1.0
         of_drive[rows] = max(least, own - look * usual)
         of_looks[rows] = look / np.maximum(many[rows], 1)

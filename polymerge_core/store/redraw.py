@@ -33,6 +33,9 @@ from polymerge_core.store.tables import Settings
 #: What lies less far from where it was has not moved, proximities.
 _AS_IT_WAS = 0.25
 
+#: Lines up to so many proximities long are drawn anew as a whole.
+_SHORT = 30.0
+
 #: The place is looked over so often for changes: what one hides may show then. What is left is found next time.
 _RENEWALS = 2
 
@@ -64,6 +67,7 @@ def redraw(
     Counts
         What became of elements.
     """
+    place = _with_whole(_elements_at(connection, settings, place), place, settings)
     shapely.prepare(place)
     stored = _elements_at(connection, settings, place)
     areas = stored.geometry.to_numpy()[is_area(stored, settings)]
@@ -89,6 +93,14 @@ def redraw(
     counts = write_elements(connection, settings, revision, now.drop(lost), was, gone, moved)
     list_unheard(connection)
     return counts
+
+
+def _with_whole(stored: gpd.GeoDataFrame, place: BaseGeometry, settings: Settings) -> BaseGeometry:
+    """Return a place with all around the short lines that reach into it: a rest of one outside is nothing by itself."""
+    lines = stored.geometry.to_numpy()[~is_area(stored, settings)]
+    short = lines[shapely.length(lines) <= _SHORT * settings.proximity]
+    around = shapely.buffer(short, REACH * settings.proximity, quad_segs=2)
+    return shapely.union_all([place, *around[~shapely.contains(place, around)]])
 
 
 def _elements_at(connection: sqlite3.Connection, settings: Settings, place: BaseGeometry) -> gpd.GeoDataFrame:
