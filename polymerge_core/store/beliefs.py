@@ -61,8 +61,8 @@ _BRIDGED = 6.0
 #: Whether a line lies elsewhere is judged over so many proximities.
 _WINDOW = 40.0
 
-#: By how much a drive is off as a whole is told for squares of so many proximities.
-_LOCAL = 100.0
+#: How much more or less a drive is off in a square of so many proximities than as a whole: so many, usually.
+_LOCAL, _DRIFT = 100.0, 0.3
 
 #: Drives are taken to be at least this far apart in what they say of a line, proximities.
 _LEAST = 0.1
@@ -360,32 +360,41 @@ def _steps(offset: Array, variance: Array, unit: float) -> Array:
 
 
 def _without_shift(offset: Array, variance: Array, places: Places, unit: float) -> Array:
-    """Take away what a drive is off in each square as a whole: the shift that its lines there say together, robustly.
+    """Take away what a drive is off as a whole, and by how much more or less in each square.
 
-    What all lines share is the vehicle's position, which drifts along its way.
+    What all lines share is the vehicle's position, which drifts along its way. In a square a line says one thing.
     """
     known = np.isfinite(offset)
     usual = np.nanmedian(np.where(known.any(axis=1, keepdims=True), offset, 0.0), axis=1, keepdims=True)
-    row, column = np.nonzero(known)
-    _, square = np.unique(np.floor(places.points / (_LOCAL * unit)), axis=0, return_inverse=True)
-    _, group = np.unique(square.ravel()[row] * offset.shape[1] + column, return_inverse=True)
-    deviation = np.sqrt(variance[row, column])
+    row, drive = np.nonzero(known)
+    deviation = np.sqrt(variance[row, drive])
     across = places.normal[row] / deviation[:, None]
-    said = (offset - usual)[row, column] / deviation
-    weight = np.ones(len(row))
+    said = (offset - usual)[row, drive] / deviation
+    said -= (across * _shift(drive, across, said, np.ones(len(row)), 1.0)).sum(axis=1)
+    _, square = np.unique(np.floor(places.points / (_LOCAL * unit)), axis=0, return_inverse=True)
+    group = np.unique(np.column_stack([square.ravel()[row], drive]), axis=0, return_inverse=True)[1].ravel()
+    _, line, times = np.unique(
+        np.column_stack([group, places.element[row]]), axis=0, return_inverse=True, return_counts=True
+    )
+    said -= (across * _shift(group, across, said, 1.0 / times[line.ravel()], _DRIFT * unit)).sum(axis=1)
+    left = offset.copy()
+    left[row, drive] = said * deviation + usual[row, 0]
+    return left
+
+
+def _shift(group: Index, across: Array, said: Array, weight: Array, usual: float) -> Array:
+    """Return for each row the shift that the rows of its group say together, robustly; of usual size before they do."""
+    held = weight.copy()
+    shift = np.zeros((group.max(initial=-1) + 1, 2))
     for _ in range(10):
-        products = (weight[:, None] * across)[:, :, None] * np.column_stack([across, said])[:, None, :]
-        sums = np.zeros((group.max(initial=-1) + 1, 2, 3))
-        np.add.at(sums, group, products)
-        matrix, wanted = sums[:, :, :2] + np.eye(2), sums[:, :, 2]
-        shift = np.linalg.solve(matrix, wanted[:, :, None])[:, :, 0]
+        sums = np.zeros((len(shift), 2, 3))
+        np.add.at(sums, group, (held[:, None] * across)[:, :, None] * np.column_stack([across, said])[:, None, :])
+        shift = np.linalg.solve(sums[:, :, :2] + np.eye(2) / usual**2, sums[:, :, 2:])[:, :, 0]
         # Cauchy's weights: what moved does not count.
-        weight = 1 / (1 + ((said - (across * shift[group]).sum(axis=1)) / HALF_WEIGHT) ** 2)
+        held = weight / (1 + ((said - (across * shift[group]).sum(axis=1)) / HALF_WEIGHT) ** 2)
     # Two places say what two numbers are.
-    shift[np.bincount(group) < 3] = 0.0
-    moved = offset.copy()
-    moved[row, column] -= (places.normal[row] * shift[group]).sum(axis=1)
-    return moved
+    shift[np.bincount(group, minlength=len(shift)) < 3] = 0.0
+    return shift[group]
 
 
 def _variance(

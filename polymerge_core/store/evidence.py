@@ -172,16 +172,13 @@ def add(connection: sqlite3.Connection, settings: Settings, evidence: Evidence, 
     instance_fid = first[0] + np.arange(len(instances))
     observation_fid = first[1] + np.arange(len(observations))
     shapes = instances["shape"].to_numpy(dtype=object)
-    there = ~pd.isna(shapes)
-    blobs = np.full(len(shapes), None, dtype=object)
-    blobs[there] = geopackage.to_blobs(shapes[there], settings.srs_id)
     counts = np.bincount(observations["at"], minlength=len(instances))
     geopackage.insert(
         connection,
         "instances",
         {
             "fid": instance_fid,
-            "geom": blobs,
+            "geom": geopackage.to_blobs(shapes, settings.srs_id),
             **{name: instances[name] for name in ("drive", "instance", "timestamp_ns", "x", "y", "heading")},
             "n_observations": counts,
             "has_footprint": instances["has_footprint"].astype(int),
@@ -203,7 +200,7 @@ def add(connection: sqlite3.Connection, settings: Settings, evidence: Evidence, 
     left_out = evidence.left_out
     columns = {name: left_out[name].astype(object) for name in left_out.columns}
     geopackage.insert(connection, "left_out", columns | {"source_fid": left_out["source_fid"].astype(str)})
-    geopackage.touched(connection, "instances", instances["shape"].to_numpy(dtype=object)[there])
+    geopackage.touched(connection, "instances", instances["shape"].to_numpy(dtype=object))
     geopackage.touched(connection, "observations", shapes)
     return instance_fid, observation_fid
 

@@ -244,7 +244,7 @@ def touched(connection: sqlite3.Connection, table: str, shapes: NDArray[np.objec
     connection.execute(
         "UPDATE gpkg_contents SET last_change = strftime('%Y-%m-%dT%H:%M:%fZ', 'now') WHERE table_name = ?", (table,)
     )
-    if shapes is None or shapely.is_empty(shapes).all():
+    if shapes is None or (shapely.is_empty(shapes) | shapely.is_missing(shapes)).all():
         return
     bounds = [float(value) for value in shapely.total_bounds(shapes)]
     for column, value, larger in zip(("min_x", "min_y", "max_x", "max_y"), bounds, (0, 0, 1, 1), strict=True):
@@ -283,8 +283,8 @@ def pairs(connection: sqlite3.Connection, one: Iterable[str], other: Iterable[st
     yield "pairs"
 
 
-def to_blobs(shapes: NDArray[np.object_], srs_id: int) -> list[bytes]:
-    """Encode geometries as GeoPackage has them: a header with their bounds, then WKB."""
+def to_blobs(shapes: NDArray[np.object_], srs_id: int) -> list[bytes | None]:
+    """Encode geometries as GeoPackage has them: a header with their bounds, then WKB. None is NULL."""
     header = np.zeros(len(shapes), _HEADER)
     header["magic"], header["srs"] = b"GP", srs_id
     empty = shapely.is_empty(shapes)
@@ -294,7 +294,7 @@ def to_blobs(shapes: NDArray[np.object_], srs_id: int) -> list[bytes]:
     heads = [row.tobytes() for row in header]
     wkb = shapely.to_wkb(shapes, byte_order=1, flavor="iso")
     return [
-        (head[:bare] if nothing else head) + body
+        None if body is None else (head[:bare] if nothing else head) + body
         for head, body, nothing in zip(heads, wkb, empty.tolist(), strict=True)
     ]
 

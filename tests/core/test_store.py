@@ -670,6 +670,18 @@ class TestVerifying:
         assert fed.verify() == []
 
 
+class TestEditedByHand:
+    def test_a_geometry_that_was_cleared_is_none_and_verify_says_so(self, store):
+        """As an attribute form of QGIS leaves it."""
+        store.update(frame(0, level(0, 0, 100), level(10, 0, 100)))
+        with contextlib.closing(connect(store.path, 1.0)) as connection:
+            connection.execute("UPDATE elements SET geom = NULL WHERE element_id = 1")
+        assert store.elements().geometry.isna().tolist() == [True, False]
+        assert any("not as their last change says" in fault for fault in store.verify())
+        store.update(frame(1, level(0.1, 0, 100), level(10.1, 0, 100)))
+        assert store.elements().geometry.notna().all()
+
+
 class TestUndo:
     def test_takes_a_local_map_back_as_if_it_had_never_come(self, tmp_path):
         """What remains is what the others alone draw, wherever they looked."""
