@@ -143,10 +143,11 @@ def restore(stored: Path, output: Path, revision: int, **chosen: Any) -> None:
 @click.option("--revision", type=click.IntRange(1), required=True, help="Which one; history lists them.")
 @click.option("--until", type=click.IntRange(1), help="With it all from --revision to this one.")
 @_patience
-@click.option("--json", "report_file", metavar="FILE", help="Write a report as JSON; - for standard output.")
-def undo(stored: Path, revision: int, until: int | None, patience: float, report_file: str | None) -> None:
+@run_options
+def undo(stored: Path, *, revision: int, until: int | None, patience: float, **chosen: Any) -> None:
     """Take back what came with a revision of the stored map MAP, as if it had never been told of it."""
-    with Job(None, [], [], overwrite=True, report_file=report_file, progress="none", watch_stdin=False) as job:
+    with Job(None, [], [], **split_off(chosen)) as job:
+        job.progress(0.1, "taking local maps out")
         report = pm.MapStore(stored, patience_s=patience).undo(revision, until).report()
         job.report(report)
     which = str(revision) if until in (None, revision) else f"{revision} to {until}"

@@ -166,6 +166,30 @@ def changes_parameters() -> list[QgsProcessingParameterDefinition]:
     ]
 
 
+def undo_parameters() -> list[QgsProcessingParameterDefinition]:
+    """Return the file of a stored map, and what of it is taken back."""
+    revision, until = (
+        QgsProcessingParameterNumber(
+            name,
+            title,
+            type=QgsProcessingParameterNumber.Type.Integer,
+            optional=name == "UNTIL",
+            minValue=1,
+            maxValue=_MOST_REVISIONS,
+        )
+        for name, title in (("REVISION", tr("Revision to take back")), ("UNTIL", tr("Until revision")))
+    )
+    return [
+        file_parameter("MAP", tr("Map"), tr("The file of a stored map, which “Update map” makes."), kinds=_MAPS),
+        explained(revision, tr("One that brought local maps; the table revisions of the map lists them.")),
+        explained(
+            until,
+            tr("With it all revisions from that one to this one are taken back; empty: only that one."),
+            advanced=True,
+        ),
+    ]
+
+
 def footprint_parameter() -> QgsProcessingParameterDefinition:
     """Return what the local maps looked at."""
     return explained(

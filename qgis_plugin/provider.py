@@ -13,6 +13,7 @@ from .algorithms.merge_local_maps import MergeLocalMaps
 from .algorithms.merge_network import MergeNetwork
 from .algorithms.project_local_maps import ProjectLocalMaps
 from .algorithms.set_up import SetUp
+from .algorithms.undo_update import UndoUpdate
 from .algorithms.update_map import UpdateMap
 from .environment import SETTING
 from .layout import icon_path, metadata
@@ -62,7 +63,16 @@ class PolyMergeProvider(QgsProcessingProvider):
 
     def loadAlgorithms(self) -> None:
         """Add the algorithms."""
-        algorithms = (SetUp, ProjectLocalMaps, MergeLocalMaps, MergeNetwork, EvaluateMap, UpdateMap, MapChanges)
+        algorithms = (
+            SetUp,
+            ProjectLocalMaps,
+            MergeLocalMaps,
+            MergeNetwork,
+            EvaluateMap,
+            UpdateMap,
+            MapChanges,
+            UndoUpdate,
+        )
         for algorithm in algorithms:
             self.addAlgorithm(algorithm())
 

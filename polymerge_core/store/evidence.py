@@ -93,43 +93,58 @@ def read_evidence(
             "map for them"
         )
     table = seen.table
-    known = [known_instances(maps, each, seen.crs) for maps, each in zip(local_maps, seen.layer_crs, strict=True)]
-    unseen = seen.left_out.loc[seen.left_out["instance"] != "", _NAMES].astype(str)
-    names = [table[_NAMES].astype(str), *(each[_NAMES] for each in known), unseen]
-    every = pd.concat(names, ignore_index=True).drop_duplicates().reset_index(drop=True)
-    index = pd.MultiIndex.from_frame(every)
-    at = index.get_indexer(pd.MultiIndex.from_frame(table[_NAMES].astype(str)))
+    known = pd.concat(
+        [known_instances(maps, each, seen.crs) for maps, each in zip(local_maps, seen.layer_crs, strict=True)],
+        ignore_index=True,
+    )
+    unseen = seen.left_out[seen.left_out["instance"] != ""]
+    names = [np.concatenate([_texts(each[name]) for each in (table, known, unseen)]) for name in _NAMES]
+    code, first = _numbered(*names)
+    at, whose = code[: len(table)], code[len(table) : len(table) + len(known)]
     shape = table["shape"].to_numpy(dtype=object)
     observations = pd.DataFrame(
         {
             "at": at,
             **{name: table[name].to_numpy() for name in ("class", "score", "is_area", "source", "from_m", "to_m")},
-            "source_fid": table["source_fid"].astype(str).to_numpy(),
+            "source_fid": _texts(table["source_fid"]),
             "shape": np.where(table["is_area"] & ~table["as_polygon"], as_lines(shape), shape),
         }
     )
-    told = (
-        pd.concat(known, ignore_index=True)
-        .drop_duplicates(_NAMES)
-        .set_index(_NAMES)
-        .reindex(index)
-        .reset_index(drop=True)
+    # What is told of a local map more than once is taken as it is told first.
+    owner, row = np.unique(whose, return_index=True)
+    position = np.full((len(first), 3), np.nan)
+    position[owner] = known[["x", "y", "heading"]].to_numpy(dtype=float)[row]
+    footprint, time = (np.full(len(first), None, dtype=object) for _ in range(2))
+    footprint[owner] = known["footprint"].to_numpy(dtype=object)[row]
+    earliest = np.full(len(first), NO_TIMESTAMP)
+    np.minimum.at(earliest, at, table["timestamp_ns"].to_numpy(dtype=np.int64))
+    time[earliest < NO_TIMESTAMP] = earliest[earliest < NO_TIMESTAMP]
+    own = known["timestamp_ns"].to_numpy(dtype=object)[row]
+    time[owner] = np.where(pd.isna(own), time[owner], own)
+    instances = pd.DataFrame(
+        {
+            **{name: texts[first] for name, texts in zip(_NAMES, names, strict=True)},
+            "timestamp_ns": pd.Series([None if value is None else int(value) for value in time], dtype=object),
+            "x": position[:, 0],
+            "y": position[:, 1],
+            "heading": np.mod(90.0 - np.degrees(position[:, 2]), 360.0),
+            "has_footprint": ~pd.isna(footprint),
+        }
     )
-    told = every.join(told)
-    earliest = pd.Series(NO_TIMESTAMP, index=every.index)
-    if len(table):
-        first = table["timestamp_ns"].groupby(at).min()
-        earliest[first.index] = first.to_numpy()
-    told["timestamp_ns"] = [
-        int(own) if own == own and own is not None else None if first == NO_TIMESTAMP else int(first)  # noqa: PLR0124
-        for own, first in zip(told["timestamp_ns"], earliest, strict=True)
-    ]
-    told["heading"] = np.mod(90.0 - np.degrees(told["heading"].to_numpy(dtype=float)), 360.0)
-    footprint = told.pop("footprint").to_numpy(dtype=object)
-    told["has_footprint"] = ~pd.isna(footprint)
-    boxes = _boxes(shape, at, len(every))
-    told["shape"] = np.where(told["has_footprint"], footprint, boxes)
-    return Evidence(told, observations, seen.left_out, seen.notes["warnings"]), seen.crs
+    instances["shape"] = np.where(instances["has_footprint"], footprint, _boxes(shape, at, len(first)))
+    return Evidence(instances, observations, seen.left_out, seen.notes["warnings"]), seen.crs
+
+
+def _texts(column: pd.Series[Any]) -> NDArray[np.object_]:
+    """Return values as text."""
+    return column.astype(str).to_numpy(dtype=object)
+
+
+def _numbered(drive: NDArray[np.object_], instance: NDArray[np.object_]) -> tuple[Index, Index]:
+    """Return a number for each pair of names, the same for the same, and the row in which each number comes first."""
+    drives, (instances, known) = pd.factorize(drive)[0], pd.factorize(instance)
+    code = pd.factorize(drives * len(known) + instances)[0]
+    return code, np.unique(code, return_index=True)[1]
 
 
 def _boxes(shapes: NDArray[np.object_], owner: Index, count: int) -> NDArray[np.object_]:

@@ -44,6 +44,7 @@ RECORD = Record(Path(ORDERS["record"]))
 ALGORITHMS = {
     "polymerge:evaluatemap": "Evaluate map",
     "polymerge:mapchanges": "Changes of a map",
+    "polymerge:undoupdate": "Undo update of a map",
     "polymerge:mergelocalmaps": "Merge local maps",
     "polymerge:mergenetwork": "Merge network",
     "polymerge:projectlocalmaps": "Project local maps",

@@ -30,7 +30,16 @@ from qgis_plugin.layout import ROOT, metadata, style_path
 
 from .layers import EAST, NORTH, file_layer, memory_layer, track
 
-IDS = ("setup", "projectlocalmaps", "mergelocalmaps", "mergenetwork", "evaluatemap", "updatemap", "mapchanges")
+IDS = (
+    "setup",
+    "projectlocalmaps",
+    "mergelocalmaps",
+    "mergenetwork",
+    "evaluatemap",
+    "updatemap",
+    "mapchanges",
+    "undoupdate",
+)
 WORKERS = IDS[1:]
 MERGERS = IDS[2:4]
 
@@ -142,6 +151,7 @@ class TestEvery:
             "evaluatemap": compared | {"OUTPUT", "EVALUATED", "EVALUATED_AREAS", "MEASURES", "PAGE"},
             "updatemap": {"MAP", "LOCAL_MAPS", "SELECTED_ONLY", "INSTANCES", "CREATE", "CLASS_FIELD"},
             "mapchanges": {"MAP", "SINCE", "CHANGES", "CHANGES_AREAS", "MOVES"},
+            "undoupdate": {"MAP", "REVISION"},
         }
         assert plain == wanted[name]
 
@@ -156,6 +166,7 @@ class TestOutputs:
             ("evaluatemap", {"AVERAGE_PRECISION", "N_ELEMENTS", "N_REFERENCE"}),
             ("updatemap", {"REVISION", "ELEMENTS", "SKIPPED", "ADDED", "CHANGED", "MOVED", "RETIRED", "MERGED"}),
             ("mapchanges", {"ADDED", "CHANGED", "MOVED", "RETIRED", "MERGED"}),
+            ("undoupdate", {"NEW_REVISION", "ELEMENTS", "ADDED", "CHANGED", "MOVED", "RETIRED", "MERGED"}),
         ],
     )
     def test_numbers_are_there_for_models(self, name, numbers):
@@ -170,7 +181,7 @@ class TestOutputs:
             for each in algorithm(name).parameterDefinitions()
             if isinstance(each, QgsProcessingParameterFeatureSink)
         ]
-        first = {"updatemap": [], "mapchanges": ["CHANGES"]}.get(name, ["OUTPUT"])
+        first = {"updatemap": [], "undoupdate": [], "mapchanges": ["CHANGES"]}.get(name, ["OUTPUT"])
         assert [each.name() for each in sinks if not each.flags() & optional] == first
         assert all(each.createByDefault() for each in sinks)
 

@@ -25,6 +25,7 @@ COMMANDS = {
     "evaluatemap": "evaluate",
     "updatemap": "update",
     "mapchanges": "changes",
+    "undoupdate": "undo",
 }
 
 #: Options that name files, which are checked or made before the command line is asked.
@@ -287,7 +288,7 @@ class TestArguments:
     def test_keep_the_order_asked_for(self, context):
         assert arguments(context, "STRICT PROXIMITY", STRICT=True, PROXIMITY=1) == ["--strict", "--proximity=1.0"]
 
-    @pytest.mark.parametrize("name", [each for each in COMMANDS if each != "mapchanges"])
+    @pytest.mark.parametrize("name", [each for each in COMMANDS if each not in ("mapchanges", "undoupdate")])
     def test_plain_metres_are_the_crs_local(self, context, name):
         assert arguments(context, "CRS", name=name, LOCAL_CRS=True) == ["--crs=local"]
         assert arguments(context, "CRS", name=name, LOCAL_CRS=False) == []

@@ -17,7 +17,16 @@ from qgis_plugin.environment import SETTING
 from qgis_plugin.layout import ROOT
 from qgis_plugin.provider import PolyMergeProvider
 
-IDS = {"setup", "projectlocalmaps", "mergelocalmaps", "mergenetwork", "evaluatemap", "updatemap", "mapchanges"}
+IDS = {
+    "setup",
+    "projectlocalmaps",
+    "mergelocalmaps",
+    "mergenetwork",
+    "evaluatemap",
+    "updatemap",
+    "mapchanges",
+    "undoupdate",
+}
 
 
 def registered():

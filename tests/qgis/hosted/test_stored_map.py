@@ -395,6 +395,38 @@ class TestTime:
         assert extent.end().toUTC().toString(Qt.DateFormat.ISODate) == APRIL
 
 
+class TestUndoing:
+    def test_takes_an_update_back_and_layers_show_it(self, update, run, ready, lines, file, context):
+        update(looks("april", 40.0, time=APRIL))
+        assert lines.featureCount() == 3
+        results = run("undoupdate", MAP=file, REVISION=2)
+        assert (results["NEW_REVISION"], results["ELEMENTS"], results["RETIRED"]) == (3, 2, 1)
+        assert lines.featureCount() == 2
+        assert not loaded(context)
+        assert results["OUTPUT"] == stored_map.address(file, "line")
+
+    def test_takes_several_back(self, update, run, ready, lines, file):
+        update(looks("april", 40.0, time=APRIL))
+        assert run("undoupdate", MAP=file, REVISION=1, UNTIL=2)["ELEMENTS"] == 0
+
+    @pytest.mark.parametrize(("revision", "said"), [(7, "no revision 7"), (None, "Revision to take back")])
+    def test_says_what_cannot_be_taken_back(self, run, ready, lines, file, revision, said):
+        before = Path(file).read_bytes()
+        with pytest.raises(QgsProcessingException, match=said):
+            run("undoupdate", MAP=file, REVISION=revision)
+        assert Path(file).read_bytes() == before
+
+    def test_needs_a_map_that_is_there(self, run, ready, tmp_path):
+        with pytest.raises(QgsProcessingException, match="There is no map"):
+            run("undoupdate", MAP=str(tmp_path / "nowhere.gpkg"), REVISION=1)
+
+    def test_leaves_a_map_alone_that_is_edited(self, run, ready, lines, file):
+        lines.startEditing()
+        with pytest.raises(QgsProcessingException, match="is being edited"):
+            run("undoupdate", MAP=file, REVISION=1)
+        lines.rollBack()
+
+
 SINKS = dict.fromkeys(("CHANGES", "CHANGES_AREAS", "MOVES"), "memory:")
 
 

@@ -11,6 +11,7 @@ ALGORITHMS = {
     "mergenetwork": "Merge network",
     "evaluatemap": "Evaluate map",
     "mapchanges": "Changes of a map",
+    "undoupdate": "Undo update of a map",
     "projectlocalmaps": "Project local maps",
     "setup": "Set up PolyMerge",
     "updatemap": "Update map",
