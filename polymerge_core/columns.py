@@ -368,7 +368,11 @@ def as_text(column: pd.Series) -> pd.Series:
     """Return values as text; whole numbers without a decimal point, whatever type a format gave them."""
     if pd.api.types.is_float_dtype(column) and (column.dropna() % 1 == 0).all():
         column = column.astype("Int64")
-    return column.astype(object).where(column.notna(), None).map(str, na_action="ignore").astype(object)
+    text = column.to_numpy(dtype=object, copy=True)
+    missing = pd.isna(column).to_numpy()
+    text[missing] = None
+    text[~missing] = [str(value) for value in text[~missing]]
+    return pd.Series(text, index=column.index, name=column.name, dtype=object)
 
 
 def _leave_out(table: pd.DataFrame, chosen: NDArray[np.bool_], reason: str) -> None:

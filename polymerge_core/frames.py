@@ -415,8 +415,8 @@ def _instances(
 
 
 def _layer(columns: dict[str, Any], geometry: NDArray[np.object_], target: pyproj.CRS) -> gpd.GeoDataFrame:
-    texts = {name: str for name in ("class", "drive", "instance") if name in columns}
-    return gpd.GeoDataFrame(pd.DataFrame(columns).astype(texts), geometry=geometry, crs=target)
+    texts = {name: pd.array(columns[name], dtype="str") for name in ("class", "drive", "instance") if name in columns}
+    return gpd.GeoDataFrame(columns | texts, geometry=geometry, crs=target)
 
 
 def _left_out(vectors: Sequence[LeftOutVector], source: str, drive: str) -> pd.DataFrame:

@@ -145,7 +145,8 @@ def observe(
     _check_shapes(parts)
     _measure(parts)
     table, duplicates = canonical_order(parts[parts["reason"].isna()], attributes)
-    left_out = _left_out(pd.concat([parts[parts["reason"].notna()], duplicates]), list(local_maps))
+    unfit = parts[parts["reason"].notna()]
+    left_out = _left_out(pd.concat([unfit, duplicates]) if len(duplicates) else unfit, list(local_maps))
     if options.strict and len(left_out):
         first = left_out.iloc[0]
         raise InputError(
@@ -157,9 +158,12 @@ def observe(
     if is_local(work):
         _note_like_degrees(table, notes)
     known = [maps.id_aliases[list(ALIAS_COLUMNS)] for maps in main_map if maps.id_aliases is not None]
-    aliases = pd.concat([empty_table(ALIAS_COLUMNS), *known], ignore_index=True)
-    main_ids = features.loc[features["main_id"] >= 0, "main_id"].to_numpy(dtype=np.int64)
-    highest = max(0, main_ids.max(initial=0), *aliases.max(skipna=True).fillna(0).astype(int))
+    aliases = (
+        pd.concat([empty_table(ALIAS_COLUMNS), *known], ignore_index=True) if known else empty_table(ALIAS_COLUMNS)
+    )
+    main_ids = features["main_id"].to_numpy(dtype=np.int64)
+    main_ids = main_ids[main_ids >= 0]
+    highest = max(0, main_ids.max(initial=0), *(int(aliases[name].max()) for name in ALIAS_COLUMNS if len(aliases)))
     return Observations(table, attributes, left_out, work, out_crs, layer_crs, aliases, main_ids, int(highest), notes)
 
 
@@ -387,9 +391,9 @@ def list_left_out(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
     DataFrame
         `LEFT_OUT_COLUMNS` of all.
     """
+    if not any(map(len, tables)):
+        return tables[0][list(LEFT_OUT_COLUMNS)]
     listed = pd.concat([table[list(LEFT_OUT_COLUMNS)] for table in tables])
-    if listed.empty:
-        return listed
     listed["instance"] = listed["instance"].astype(str)
     keys = ["source", "drive", "instance", "reason", "from_m", "to_m", "source_fid"]
     text = listed["source_fid"].astype(str)

@@ -71,7 +71,7 @@ def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
 def _instance_rank(parts: pd.DataFrame) -> NDArray[np.intp]:
     """Rank the local maps; equal content without a name has equal rank, the main map rank -1."""
     names = ["is_main", "instance_kind", "drive", "instance"]
-    if len(parts) and all((parts[name] == parts[name].iloc[0]).all() for name in names):
+    if _all_alike(parts, names):
         return np.full(len(parts), -1 if parts["is_main"].iloc[0] else 0, dtype=np.intp)
     group = parts.groupby(names, sort=False).ngroup().to_numpy()
     drive_start = parts.groupby("drive")["timestamp_ns"].transform("min").to_numpy()
@@ -118,6 +118,12 @@ def _instance_rank(parts: pd.DataFrame) -> NDArray[np.intp]:
     return rank[group] if len(rank) else np.empty(0, np.intp)
 
 
+def _all_alike(table: pd.DataFrame, names: list[str]) -> bool:
+    """Whether all rows have the same values in some columns, as those of a single local map have."""
+    columns = (table[name].to_numpy(dtype=object) for name in names)
+    return len(table) > 0 and all((column == column[0]).all() for column in columns)
+
+
 def natural_rank(texts: pd.Series[str]) -> NDArray[np.intp]:
     """Rank texts as `natural_key` orders them."""
     codes, names = pd.factorize(texts)
@@ -153,6 +159,8 @@ def _tie_break(parts: pd.DataFrame, attributes: pd.DataFrame) -> NDArray[np.obje
 
 def _group_in_order(table: pd.DataFrame) -> NDArray[np.intp]:
     """Give each local map the number of its first observation, -1 to the main map."""
+    if _all_alike(table, ["is_main", "drive", "instance", "instance_kind"]):
+        return np.full(len(table), -1 if table["is_main"].iloc[0] else 0, dtype=np.intp)
     local = table[~table["is_main"]]
     codes = local.groupby(["drive", "instance", "instance_kind"], sort=False).ngroup()
     group = np.full(len(table), -1, dtype=np.intp)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import geopandas as gpd
@@ -135,6 +136,11 @@ def polygons_apart(name: str, areas_name: str, frame: gpd.GeoDataFrame) -> dict[
 
 def empty_table(columns: Iterable[str]) -> pd.DataFrame:
     """Return a table without rows whose columns have the contract's types."""
+    return _empty_table(tuple(columns)).copy()
+
+
+@cache
+def _empty_table(columns: tuple[str, ...]) -> pd.DataFrame:
     text = ("source", "drive", "instance", "reason")
     kinds = dict.fromkeys(text, "str") | {"element_id": "int64", "old_id": "int64", "source_fid": "int64"}
     return pd.DataFrame({name: pd.Series(dtype=kinds.get(name, "float64")) for name in columns})
