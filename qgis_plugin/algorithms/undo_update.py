@@ -9,7 +9,7 @@ from qgis.core import QgsProcessingContext, QgsProcessingParameterDefinition
 
 from ..parameters import absolute_file, undo_parameters
 from ..progress import Part
-from ..translation import mark
+from ..translation import mark, tr
 from .base import Parameters, Staged
 from .writes_map import ELEMENT_NUMBERS, WritesMap
 
@@ -35,6 +35,12 @@ class UndoUpdate(WritesMap):
     def inputs(self) -> list[QgsProcessingParameterDefinition]:
         """Return the map and the revision."""
         return undo_parameters()
+
+    def fault(self, parameters: Parameters, context: QgsProcessingContext) -> str:
+        """Return what is wrong with the map, or that the revision is missing."""
+        if parameters.get("REVISION") is None:
+            return tr("Revision to take back (REVISION) is empty: choose one of the table revisions of the map.")
+        return super().fault(parameters, context)
 
     def stage(self, parameters: Parameters, context: QgsProcessingContext, folder: Path, part: Part) -> Staged:
         """Name the map, which the worker writes itself."""

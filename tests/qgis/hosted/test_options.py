@@ -172,6 +172,8 @@ class TestTheSame:
             "MIN_SCORE": (0, 1),
             "COVERAGE": (0, 1),
             "SINCE": (0, 2**31 - 1),
+            "REVISION": (1, 2**31 - 1),
+            "UNTIL": (1, 2**31 - 1),
         }
         found = {
             each: (it.minimum(), it.maximum())
@@ -192,10 +194,14 @@ class TestTheSame:
         calls = []
         for name, command in COMMANDS.items():
             options = option_arguments(algorithm(name).OPTIONS, algorithm(name), {"CRS": "EPSG:32632"}, context)
-            files = {"project": ["--poses=/nowhere.csv"], "evaluate": ["--reference=/truth.gpkg"]}.get(command, [])
+            needed = {
+                "project": ["--poses=/nowhere.csv"],
+                "evaluate": ["--reference=/truth.gpkg"],
+                "undo": ["--revision=1"],
+            }
             target = [f"{each}=/nowhere.gpkg" for each in [algorithm(name).LAYERS_OPTION] if each]
-            inputs = ["/nowhere.json"] if target else ["/nowhere.gpkg", "/nowhere.json"]
-            calls.append([command, *options, *files, *target, "--", *inputs])
+            inputs = ["/nowhere.gpkg", "/nowhere.json"] if command == "update" else ["/nowhere.json"]
+            calls.append([command, *options, *needed.get(command, []), *target, "--", *inputs])
         asked = [interpreter, "-c", code, json.dumps(calls)]
         done = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=True)
         assert json.loads(done.stdout) == [1] * len(COMMANDS), (
