@@ -300,7 +300,7 @@ def test_requirements_are_the_dependencies_of_the_package():
 
 class TestIcons:
     def test_there_is_one_for_the_plugin_and_each_algorithm(self):
-        names = ["changes", "evaluate", "merge", "network", "polymerge", "project", "setup", "update"]
+        names = ["changes", "evaluate", "merge", "network", "polymerge", "project", "setup", "undo", "update"]
         assert [path.stem for path in ICONS] == names
 
     @pytest.mark.parametrize("path", ICONS, ids=lambda path: path.stem)
