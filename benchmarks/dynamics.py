@@ -5,7 +5,7 @@
 Drives are simulated on real roads (Argoverse 2; without FOLDER through the simulated town). ``changes``: after the
 second drive dividers vanish, a boundary moves by 1.5 m, a divider is painted 0.8 m aside, and a crossing and a divider
 appear. ``errors``: how far the map is off after 1, 2, 4 and 8 drives. ``unchanged``: what is taken for a change on a
-road that stays as it is. ``frames``: a map that was fed one frame at a time beside one merge of all. ``real``: the real
+road that stays as it is. ``frames``: a map that was fed one frame at a time beside one that was fed all at once. ``real``: the real
 drives of `deecamp`, one after another.
 """
 
@@ -211,7 +211,7 @@ def apart(one: gpd.GeoDataFrame, other: gpd.GeoDataFrame) -> dict[str, float]:
 
 
 def one_by_one(local: list[pm.LocalMaps], folder: Path, draw_every: int) -> dict[str, float]:
-    """Feed a map frame by frame, drawing every so many, and merge all of them at once; compare the two maps."""
+    """Feed a map frame by frame, drawing every so many, and another one all of them at once; compare the two."""
     path = folder / "frames.gpkg"
     path.unlink(missing_ok=True)
     store = pm.MapStore(path, create=True)
@@ -226,7 +226,10 @@ def one_by_one(local: list[pm.LocalMaps], folder: Path, draw_every: int) -> dict
                 draw=waiting % draw_every == 0,
             )
     store.draw()
-    return apart(store.elements(), pm.merge(local).elements)
+    path.with_name("at_once.gpkg").unlink(missing_ok=True)
+    at_once = pm.MapStore(path.with_name("at_once.gpkg"), create=True)
+    at_once.update(local)
+    return apart(store.elements(), at_once.elements())
 
 
 def real(data: Path, folder: Path) -> list[dict[str, float]]:

@@ -49,6 +49,9 @@ CHANGE = 0.005
 #: From these log-odds on an element is sure, 20 to 1.
 SURE_OF = 3.0
 
+#: Below these log-odds an element is not there: 20 to 1, and even if one drive was wrong.
+DENIED = -(SURE_OF + DRIVE)
+
 #: Places along lines are judged at steps of so many proximities.
 _STEP = 2.0
 
@@ -188,7 +191,9 @@ def _sightings(
     own = np.array(
         [pair in pairs for pair in zip(row.tolist(), places.element[place].tolist(), strict=True)], dtype=bool
     )
-    cls = elements["class"].to_numpy()[places.element[place]] == observations["class"].to_numpy()[row]
+    # Of areas that overlap each is seen by its own looks alone.
+    line = np.isfinite(places.normal[place, 0])
+    cls = line & (elements["class"].to_numpy()[places.element[place]] == observations["class"].to_numpy()[row])
     near = np.zeros(len(row), dtype=bool)
     near[cls] = shapely.dwithin(as_lines(shapes[row[cls]]), points[place[cls]], unit)
     kept = own | near
@@ -308,7 +313,7 @@ def _moved(
     begin = np.searchsorted(places.element, places.element)
     end = np.searchsorted(places.element, places.element, side="right") - 1
     around = _together(offset, of_drive, of_looks, np.maximum(every - half, begin), np.minimum(every + half, end))
-    return _runs(places, elements, _steps(*around, unit), "moved", order, unit, shortest=0.0)
+    return _runs(places, elements, _steps(*around, unit), "moved", order, unit)
 
 
 def _together(offset: Array, of_drive: Array, of_looks: Array, first: Index, last: Index) -> tuple[Array, Array]:
@@ -424,7 +429,6 @@ def _runs(
     kind: str,
     order: DriveOrder,
     unit: float,
-    shortest: float = _SHORTEST,
 ) -> list[Renewal]:
     """Return stretches of elements along which a change is the likeliest story, each with its likeliest time."""
     # Of drives in no order nobody can tell what came first.
@@ -442,7 +446,9 @@ def _runs(
             inside = rows[run[0] : run[-1] + 1]
             sure = inside[best[inside] > 0]
             whole = len(inside) >= 0.8 * len(rows)
-            if len(sure) == 0 or not (whole or len(sure) * _STEP >= shortest):
+            # A short line is there or not as a whole; where it lies is known of longer ones.
+            enough = len(sure) * _STEP >= _SHORTEST or (whole and kind != "moved")
+            if len(sure) == 0 or not enough:
                 continue
             zone = shapely.buffer(_along(shapes[element], places.points[inside], whole=whole, unit=unit), REACH * unit)
             since = int(order.first[int(np.argmax(gain[sure].sum(axis=0))) + 1])

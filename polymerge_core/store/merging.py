@@ -9,6 +9,7 @@ import geopandas as gpd
 import numpy as np
 import pandas as pd
 import shapely
+from numpy.typing import NDArray
 
 from polymerge_core.consensus.alongside import REACH
 from polymerge_core.consensus.run import UNSUPPORTED
@@ -49,6 +50,17 @@ def merge_all(context: Context, settings: Settings) -> Merged:
     lineage["row"] = np.searchsorted(result.elements["element_id"], lineage["element_id"])
     left_out = pd.concat([left_out, pieces.lost.assign(reason=RENEWED)], ignore_index=True)
     return Merged(result.elements, lineage, left_out, pieces)
+
+
+def without(merged: Merged, chosen: NDArray[np.bool_]) -> Merged:
+    """Leave elements out; what they were made of is in none."""
+    if not chosen.any():
+        return merged
+    elements = merged.elements[~chosen].reset_index(drop=True)
+    lost = chosen[merged.lineage["row"]]
+    lineage = merged.lineage[~lost].assign(row=(np.cumsum(~chosen) - 1)[merged.lineage["row"][~lost]])
+    left_out = pd.concat([merged.left_out, merged.lineage[lost].assign(reason=UNSUPPORTED)], ignore_index=True)
+    return merged._replace(elements=elements, lineage=lineage, left_out=left_out)
 
 
 def newest(context: Context, merged: Merged, settings: Settings) -> tuple[gpd.GeoDataFrame, pd.DataFrame]:

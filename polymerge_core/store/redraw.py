@@ -20,13 +20,13 @@ from polymerge_core.consensus.alongside import REACH
 from polymerge_core.curves import Index
 from polymerge_core.schema import NO_ELEMENT
 from polymerge_core.store import geopackage
-from polymerge_core.store.beliefs import Renewal, judge_elements
+from polymerge_core.store.beliefs import DENIED, Renewal, judge_elements
 from polymerge_core.store.drive_order import order_drives
 from polymerge_core.store.element_table import Counts, count_looks, displacement, read_elements, write_elements
 from polymerge_core.store.evidence import Context, read_context, with_renewed
 from polymerge_core.store.identity import assign_ids, count_votes
 from polymerge_core.store.lineage import attribute, list_unheard, read_lineage, share_out
-from polymerge_core.store.merging import Merged, merge_all, newest
+from polymerge_core.store.merging import Merged, merge_all, newest, without
 from polymerge_core.store.shapes import as_table, assemble, is_area
 from polymerge_core.store.tables import Settings
 
@@ -124,7 +124,7 @@ def _merged(
         found += new
         context = with_renewed(connection, settings, context)
         merged = merge_all(context, settings)
-    return merged, found
+    return without(merged, merged.elements["evidence"].to_numpy(dtype=float) < DENIED), found
 
 
 def _judge(context: Context, merged: Merged, place: BaseGeometry, settings: Settings, *, hidden: bool) -> list[Renewal]:
