@@ -5,8 +5,8 @@
 Drives are simulated on real roads (Argoverse 2; without FOLDER through the simulated town). ``changes``: after the
 second drive dividers vanish, a boundary moves by 1.5 m, a divider is painted 0.8 m aside, and a crossing and a divider
 appear. ``errors``: how far the map is off after 1, 2, 4 and 8 drives. ``unchanged``: what is taken for a change on a
-road that stays as it is. ``frames``: a map that was fed one frame at a time beside one that was fed all at once. ``real``: the real
-drives of `deecamp`, one after another.
+road that stays as it is. ``frames``: a map that was fed one frame at a time beside one that was fed all at once.
+``real``: the real drives of `deecamp`, one after another.
 """
 
 from __future__ import annotations
