@@ -23,6 +23,7 @@ from benchmarks.scenarios import town
 from polymerge_core import MapStore
 from polymerge_core.crs import LOCAL_CRS
 from polymerge_core.store import shapes
+from polymerge_core.store.beliefs import DENIED, Judgement
 from polymerge_core.store.element_table import displacement
 from polymerge_core.store.geopackage import connect
 from tests.core.layers import read_only
@@ -668,6 +669,21 @@ class TestVerifying:
     def test_does_not_mind_what_others_keep_in_the_file(self, fed):
         looks(level(0), crs=UTM).to_file(fed.path, layer="notes", mode="a")
         assert fed.verify() == []
+
+
+class TestDenied:
+    def test_what_the_evidence_denies_is_in_no_element_and_is_listed(self, store, monkeypatch):
+        def judged(elements, *_args):
+            far = elements.geometry.centroid.y.to_numpy() > 5
+            return Judgement(np.where(far, DENIED - 0.1, DENIED), [])
+
+        monkeypatch.setattr("polymerge_core.store.redraw.judge_elements", judged)
+        update = store.update([frame(number, level(0, 0, 100), level(10, 0, 100)) for number in range(2)])
+        assert (update.added, len(store.elements())) == (1, 1)
+        assert read(store, "SELECT DISTINCT element_id FROM lineage") == [(1,)]
+        rows = read(store, "SELECT reason, COUNT(*) FROM left_out GROUP BY reason")
+        assert rows == [("seen by too few of the local maps that looked there", 2)]
+        assert store.verify() == []
 
 
 class TestEditedByHand:
