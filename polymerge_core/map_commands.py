@@ -101,10 +101,11 @@ def history(stored: Path, report_file: str | None) -> None:
     """List the revisions of the stored map MAP."""
     with Job(None, [], [], overwrite=True, report_file=report_file, progress="none", watch_stdin=False) as job:
         revisions = pm.MapStore(stored).history()
-        job.report({"revisions": revisions.to_dict("records")})
+        told = revisions.astype(object).where(revisions.notna(), None)
+        job.report({"revisions": told.to_dict("records")})
     if report_file is None:
         shown = revisions.drop(columns="software")
-        click.echo(shown.to_string(index=False) if len(shown) else "no revisions")
+        click.echo(shown.to_string(index=False, na_rep="") if len(shown) else "no revisions")
 
 
 @click.command()

@@ -89,7 +89,7 @@ def run_stream(
         _draw(store, total)
     if not number - faults or not total:
         what = "no frames; send one JSON object a line" if not faults else "no line that could be used"
-        raise InputError(f"standard input held {what}; {store.path} is as it was")
+        raise InputError(f"standard input held {what}; nothing was written")
     return total | {"unusable_lines": faults}
 
 

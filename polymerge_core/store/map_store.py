@@ -314,7 +314,8 @@ class MapStore:
     def history(self) -> pd.DataFrame:
         """Return the revisions: number, time, source, what was new and what changed, and who wrote it."""
         with self._opened() as (connection, _):
-            return pd.read_sql_query("SELECT * FROM revisions ORDER BY number", connection)
+            found = pd.read_sql_query("SELECT * FROM revisions ORDER BY number", connection)
+        return found.astype({"undone": "Int64"})
 
     def changes(self, since: int = 0) -> gpd.GeoDataFrame:
         """Return what became of each element since a revision.

@@ -411,6 +411,8 @@ class TestUndo:
         assert before["n_instances"].max() == 2
         assert look(city, "elements")["n_instances"].tolist() == [1, 1]
         assert "undo of revision 2" in run("history", city).out
+        told = json.loads(run("history", city, "--json", "-").out)["revisions"]
+        assert [each["undone"] for each in told] == [None, 3, None]
         assert pm.MapStore(city).verify() == []
 
     def test_takes_back_several_at_once(self, run, city):
