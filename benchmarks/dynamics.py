@@ -179,9 +179,9 @@ def errors(road: Road, seed: int, folder: Path) -> list[dict[str, float]]:
     return found
 
 
-def unchanged(road: Road, seed: int, count: int, folder: Path) -> dict[str, Any]:
+def unchanged(road: Road, seed: int, count: int, path: Path) -> dict[str, Any]:
     """Feed a map drives on a road that stays as it is; count what it takes for changes, and what it loses."""
-    store = pm.MapStore(folder / f"unchanged_{seed}.gpkg", create=True)
+    store = pm.MapStore(path, create=True)
     lost = dict.fromkeys(("retired", "merged"), 0)
     for number, drive in enumerate(drives(road, road, seed, None, count)):
         sure = set(store.elements().query("state == 'confirmed'")["element_id"]) if number else set()
@@ -281,7 +281,7 @@ def main() -> None:
             figures["frames"] = _frames(roads, options, Path(name))
         if "unchanged" in options.only:
             for road, held in roads.items():
-                figures[f"unchanged {road}"] = told = unchanged(held, 7, options.unchanged, Path(name))
+                figures[f"unchanged {road}"] = told = unchanged(held, 7, options.unchanged, Path(name, f"{road}.gpkg"))
                 print(f"{road}, {options.unchanged} drives, nothing changes: {told}", flush=True)
         if "real" in options.only and options.data:
             figures["real"] = real(options.data, Path(name))
