@@ -47,6 +47,9 @@ DRIVE = 3.5
 #: The chance that a place changes between two drives.
 CHANGE = 0.005
 
+#: From these log-odds on a change is noted, 3 to 1: what was seen before is lost with it.
+_LIKELY = float(np.log(3.0))
+
 #: From these log-odds on an element is sure, 20 to 1.
 SURE_OF = 3.0
 
@@ -252,14 +255,14 @@ def _runs(
     found = []
     shapes = elements.geometry.to_numpy()
     # Few elements have any such place.
-    for element in np.unique(places.element[best > 0]):
+    for element in np.unique(places.element[best > _LIKELY]):
         rows = np.flatnonzero(places.element == element)
         # Where one place changed, that its neighbours did too is as likely as not: only what is seen of them counts.
-        chosen = np.flatnonzero(best[rows] > -_COST)
+        chosen = np.flatnonzero(best[rows] > _LIKELY - _COST)
         gaps = np.flatnonzero(np.diff(chosen) > max(1.0, _BRIDGED / STEP)) + 1
         for run in np.split(chosen, gaps):
             inside = rows[run[0] : run[-1] + 1]
-            sure = inside[best[inside] > 0]
+            sure = inside[best[inside] > _LIKELY]
             whole = len(inside) >= 0.8 * len(rows)
             # A short line is there or not as a whole; where it lies is known of longer ones.
             enough = len(sure) * STEP >= _SHORTEST or (whole and kind != "moved")

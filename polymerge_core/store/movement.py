@@ -13,7 +13,7 @@ from polymerge_core.consensus.fusion import CORRELATION, HALF_WEIGHT, MAD
 from polymerge_core.curves import Array, Index
 from polymerge_core.observations import as_lines
 from polymerge_core.store.drive_order import DriveOrder
-from polymerge_core.store.places import STEP, TINY, Places
+from polymerge_core.store.places import STEP, Places
 
 #: Whether a line lies elsewhere is judged over so many proximities.
 _WINDOW = 40.0
@@ -121,7 +121,7 @@ def _steps(offset: Array, variance: Array, unit: float, cost: float) -> Array:
         )
         # Where drives differ more than usual on either side, a step is less sure.
         apart = sum(
-            (np.where(there, (value - mean[:, None]) ** 2 / np.maximum(spread, TINY), 0.0)).sum(axis=1)
+            np.where(there, (value - mean[:, None]) ** 2 / np.where(there, spread, 1.0), 0.0).sum(axis=1)
             for value, there, spread, mean in (
                 (value[enough, side], there[enough, side], spread[enough, side], mean)
                 for side, mean in zip(sides, means, strict=True)

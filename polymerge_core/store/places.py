@@ -15,7 +15,7 @@ from polymerge_core.curves import Array, Curves, Index, count_up
 #: Places along lines are judged at steps of so many proximities.
 STEP = 2.0
 
-TINY = float(np.finfo(float).tiny)
+_TINY = float(np.finfo(float).tiny)
 
 
 class Places(NamedTuple):
@@ -38,7 +38,7 @@ def places_along(elements: gpd.GeoDataFrame, area: NDArray[np.bool_], place: Bas
     points = curves.points_at(line, position)
     half = 0.5 * unit
     chord = curves.points_at(line, position + half) - curves.points_at(line, position - half)
-    chord /= np.maximum(np.hypot(*chord.T), TINY)[:, None]
+    chord /= np.maximum(np.hypot(*chord.T), _TINY)[:, None]
     centres = shapely.get_coordinates(shapely.centroid(shapes[area])).reshape(-1, 2)
     every = np.concatenate([points, centres])
     owner = np.concatenate([rows[line], np.flatnonzero(area)])

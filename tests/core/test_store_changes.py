@@ -12,6 +12,7 @@ import shapely
 from shapely import LineString, box
 
 import polymerge_core as pm
+from polymerge_core.store.movement import _steps
 
 CRS = "EPSG:32632"
 ORIGIN = np.array([500_000.0, 5_000_000.0])
@@ -250,6 +251,29 @@ def test_where_drives_often_miss_a_line_two_that_do_are_not_enough(store):
         store.update(drive(number, *always))
     assert renewals(store) == []
     assert len(store.elements()) == 7
+
+
+@pytest.mark.parametrize(("without", "noted"), [(5, []), (9, [("divider", "appeared", "d9")])])
+def test_a_change_that_is_hardly_likelier_than_none_is_not_noted(store, without, noted):
+    """Each drive that does not see a line says little here: five of them are no reason to take it for a new one."""
+    flickering = (straight(-12), straight(-8), straight(-4), straight(4), straight(8), straight(12))
+    for number in range(without):
+        store.update(drive(number, *[line for at, line in enumerate(flickering) if (at + number) % 3]))
+    for number in range(without, without + 2):
+        store.update(drive(number, *flickering, straight(0)))
+    assert renewals(store) == noted
+    assert len(store.elements()) == 7
+
+
+def test_a_drive_that_did_not_see_a_line_says_nothing_of_where_it_lies():
+    """Also where the line lies far from where it was, for the other drives."""
+    offset = np.array([[0.0, 0.1, 2.4, 2.3, 2.5]])
+    told = _steps(offset, np.full((1, 5), 0.01), 1.0, 5.0)
+    between = np.insert(offset, [1, 4], np.nan, axis=1)
+    with_others = _steps(between, np.where(np.isnan(between), np.nan, 0.01), 1.0, 5.0)
+    assert told[0, 1] > 100
+    np.testing.assert_allclose(with_others[0, 2:4], told[0, 1:3])
+    assert np.isneginf(np.delete(with_others[0], [2, 3])).all()
 
 
 def test_undoing_the_drives_that_saw_a_line_vanish_brings_it_back(known):
