@@ -34,7 +34,7 @@ test-qgis: export QT_QPA_PLATFORM := offscreen
 test-qgis: export COVERAGE_FILE := .coverage_qgis
 test-qgis: export POLYMERGE_QGIS := required
 test-qgis: $(QGIS_VENV)/test
-	$(QGIS_VENV)/bin/python -m pytest tests/qgis/hosted --confcutdir=tests/qgis \
+	$(QGIS_VENV)/bin/python -m pytest tests/qgis/hosted --confcutdir=tests/qgis -n auto --dist worksteal \
 	  --cov=qgis_plugin --cov-branch --cov-report=term --cov-fail-under=85
 
 lint: $(VENV)/lint lint-plugin
@@ -98,7 +98,7 @@ $(VENV)/lint: $(VENV)/runtime
 # Nothing else may go in here: QGIS must find the system's numpy and the like.
 $(QGIS_VENV)/test: | qgis
 	$(call venv,$(QGIS_PYTHON),$(QGIS_VENV),--system-site-packages)
-	$(QGIS_VENV)/bin/python -m pip install --quiet "pytest>=8" "pytest-qgis>=3" "pytest-cov>=5"
+	$(QGIS_VENV)/bin/python -m pip install --quiet "pytest>=8" "pytest-qgis>=3" "pytest-cov>=5" "pytest-xdist>=3"
 	touch $@
 
 # The pictures of docs/qgis.md, taken in the desktop of QGIS.

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 
 import pytest
 
-if find_spec("qgis") is None or find_spec("pytest_qgis") is None:
+_HERE = find_spec("qgis") is not None and find_spec("pytest_qgis") is not None
+if not _HERE:
     collect_ignore_glob = ["*.py"]
-else:
-    from .host import (  # noqa: F401 - fixtures
-        context,
-        feedback,
-        interpreter,
-        own_profile,
-        processing_plugin,
-        provider,
-        ready,
-        run,
-        script,
-    )
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Have the fixtures where tests run: the process that only hands tests out to others has no QGIS."""
+    config = session.config
+    hands_out = config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput")
+    if _HERE and not hands_out:
+        config.pluginmanager.register(import_module(".host", __package__))
 
 
 @pytest.hookimpl(trylast=True)

@@ -17,6 +17,7 @@ from qgis.core import (
     QgsProject,
     QgsSettings,
 )
+from qgis.PyQt.QtCore import QSettings
 
 from qgis_plugin import classFactory, environment
 from qgis_plugin.layout import ROOT
@@ -63,7 +64,15 @@ class Recorder(QgsProcessingFeedback):
 
 
 @pytest.fixture(scope="session")
-def processing_plugin(qgis_app) -> None:
+def own_settings(qgis_app, tmp_path_factory) -> None:
+    """Keep settings apart from those of whoever tests, and from those of other processes that test."""
+    folder = str(tmp_path_factory.mktemp("settings"))
+    for kind in (QSettings.NativeFormat, QSettings.IniFormat):
+        QSettings.setPath(kind, QSettings.UserScope, folder)
+
+
+@pytest.fixture(scope="session")
+def processing_plugin(own_settings) -> None:
     """Start QGIS's own Processing plugin, whose warnings are not ours."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
