@@ -16,6 +16,7 @@ import json
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,9 @@ BOUNDARY_M, DIVIDER_M = 1.5, 0.8
 
 #: A change counts as found where what was found lies along half of it, no farther away than this, metres.
 _NEAR = 2.5
+
+#: What lies along the road's for the most part, no farther away than this, metres, is really there.
+_THERE = 1.5
 
 #: The error is looked at after so many drives, of these classes.
 STAGES, LINES = (1, 2, 4, 8), ("divider", "boundary")
@@ -182,16 +186,32 @@ def errors(road: Road, seed: int, folder: Path) -> list[dict[str, float]]:
 def unchanged(road: Road, seed: int, count: int, path: Path) -> dict[str, Any]:
     """Feed a map drives on a road that stays as it is; count what it takes for changes, and what it loses."""
     store = pm.MapStore(path, create=True)
-    lost = dict.fromkeys(("retired", "merged"), 0)
+    lost = dict.fromkeys(("retired", "of these really there", "merged"), 0)
     for number, drive in enumerate(drives(road, road, seed, None, count)):
-        sure = set(store.elements().query("state == 'confirmed'")["element_id"]) if number else set()
+        before = store.elements().query("state == 'confirmed'") if number else None
         done = store.update(drive.local)
-        if number:
+        if before is not None:
             now = store.changes(done.revision - 1)
-            for kind in lost:
-                lost[kind] += int((now["element_id"].isin(sure) & (now["kind"] == kind)).sum())
+            gone = {kind: before["element_id"].isin(now.loc[now["kind"] == kind, "element_id"]) for kind in lost}
+            lost["retired"] += int(gone["retired"].sum())
+            lost["of these really there"] += sum(is_there(*each, road) for each in _told(before[gone["retired"]]))
+            lost["merged"] += int(gone["merged"].sum())
     kinds = renewals(store.path)["kind"].value_counts().to_dict()
     return {"confirmed elements lost": lost, "taken for changes": kinds, "elements": len(store.elements())}
+
+
+def is_there(cls: str, shape: shapely.Geometry, road: Road) -> bool:
+    """Return whether an element is really there: half of an area within one of the road's, half of a line along one."""
+    true = road.truth.geometry[road.truth["class"] == cls].to_numpy()
+    if cls == "ped_crossing":
+        shape, true = shapely.Polygon(shape), np.array([shapely.Polygon(line) for line in as_lines(true)])
+        return bool(shapely.area(shapely.intersection(true, shape)).max(initial=0.0) > 0.5 * shape.area)
+    along = shapely.intersection(shape, shapely.union_all(shapely.buffer(true, _THERE)))
+    return bool(along.length > 0.5 * shape.length)
+
+
+def _told(elements: gpd.GeoDataFrame) -> Iterator[tuple[str, shapely.Geometry]]:
+    return zip(elements["class"], as_lines(elements.geometry.to_numpy()), strict=True)
 
 
 def apart(one: gpd.GeoDataFrame, other: gpd.GeoDataFrame) -> dict[str, float]:

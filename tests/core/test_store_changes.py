@@ -258,9 +258,9 @@ def test_a_change_that_is_hardly_likelier_than_none_is_not_noted(store, without,
     """Each drive that does not see a line says little here: five of them are no reason to take it for a new one."""
     flickering = (straight(-12), straight(-8), straight(-4), straight(4), straight(8), straight(12))
     for number in range(without):
-        store.update(drive(number, *[line for at, line in enumerate(flickering) if (at + number) % 3]))
+        store.update(drive(number, *[line for at, line in enumerate(flickering) if (at + number) % 3], frames=5))
     for number in range(without, without + 2):
-        store.update(drive(number, *flickering, straight(0)))
+        store.update(drive(number, *flickering, straight(0), frames=5))
     assert renewals(store) == noted
     assert len(store.elements()) == 7
 
