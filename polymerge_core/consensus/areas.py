@@ -14,7 +14,7 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from polymerge_core.consensus.association import Links, link_groups
+from polymerge_core.consensus.association import SIDE_BY_SIDE, Links, link_groups
 from polymerge_core.consensus.fusion import HALF_WEIGHT
 from polymerge_core.consensus.known import KnownAreas, nothing_known
 from polymerge_core.consensus.looks import Instances
@@ -23,6 +23,10 @@ from polymerge_core.curves import Array, Index, distinct
 
 #: Looks belong together where they have this share of the smaller one in common, in the mean.
 OVERLAP = 0.5
+
+#: An area that has this share in common with another one, in the mean of the looks at both, which so many times as many
+#: local maps saw and hardly any beside it, is that other one seen badly: who saw it looked there, and did not see two.
+_SHADOW, _MANY = 0.25, 3
 
 #: What is left of one that was cut off may lie so many proximities beside the area: it may be narrower than errors are.
 _BESIDE = 0.5
@@ -103,7 +107,8 @@ def merge_looks_at_areas(
     edges = _edges(instance, instances)
     edges[count:] = None
     whole = np.append(held_whole(polygons[:count], edges[:count], unit), before.whole)
-    group = group_areas(polygons, instance, whole, unit)
+    links = _links(polygons, instance)
+    group = group_areas(polygons, instance, links, whole, unit)
     order = np.argsort(group, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if count + len(before.weight) else []
     fused = [fuse_areas(polygons[row], weight[row], edges[row], whole[row], unit) for row in members]
@@ -115,7 +120,7 @@ def merge_looks_at_areas(
     past = np.zeros((len(shapes), len(Support._fields)))
     np.add.at(past, group[count:], before.support)
     support = Support._make(new + old for new, old in zip(support, past.T, strict=True))
-    kept = support.enough
+    kept = support.enough & ~_shadows(polygons, instance, instances, links, group)
     number = np.where(kept, np.cumsum(kept) - 1, -1)
     known = KnownAreas(
         shapes,
@@ -133,12 +138,8 @@ def merge_looks_at_areas(
     )
 
 
-def group_areas(polygons: NDArray[np.object_], instance: Index, whole: NDArray[np.bool_], unit: float) -> Index:
-    """Group looks at the same area, numbered from 0 in the order of their first looks.
-
-    Looks that hold their area whole say which areas there are. One that was cut off has a share of any of them that
-    it reaches into: it joins the one that it has most in common with; those that join none are grouped by themselves.
-    """
+def _links(polygons: NDArray[np.object_], instance: Index) -> Links:
+    """Return what looks that overlap have in common: as with lines, a cost over a length, 0 of one local map."""
     first, second = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     once = first < second
     first, second = first[once], second[once]
@@ -146,13 +147,49 @@ def group_areas(polygons: NDArray[np.object_], instance: Index, whole: NDArray[n
     area = shapely.area(polygons)
     share = common / np.minimum(area[first], area[second])
     same = instance[first] == instance[second]
-    # As with lines, a cost over a length: how little they have in common, against how little they may.
+    # How little they have in common, against how little they may.
     cost = np.where(same, 0.0, (1.0 - share) / (1.0 - OVERLAP))
-    links = Links(first, second, cost, np.where(same, 0.0, 1.0), np.zeros(len(first)), same.astype(float))
-    alike = whole[first] == whole[second]
+    return Links(first, second, cost, np.where(same, 0.0, 1.0), np.zeros(len(first)), same.astype(float))
+
+
+def group_areas(
+    polygons: NDArray[np.object_], instance: Index, links: Links, whole: NDArray[np.bool_], unit: float
+) -> Index:
+    """Group looks at the same area, numbered from 0 in the order of their first looks.
+
+    Looks that hold their area whole say which areas there are. One that was cut off has a share of any of them that
+    it reaches into: it joins the one that it has most in common with; those that join none are grouped by themselves.
+    """
+    alike = whole[links.first] == whole[links.second]
     group = link_groups(instance, np.ones(len(polygons)), links.take(alike), 1.0)
     joined = _join_cut(polygons, links.take(~alike), group, whole, unit)
     return np.asarray(pd.factorize(joined)[0], dtype=np.intp)
+
+
+def _shadows(
+    polygons: NDArray[np.object_], instance: Index, instances: Instances, links: Links, group: Index
+) -> NDArray[np.bool_]:
+    """Tell which areas are no areas of their own, but others seen badly.
+
+    None where footprints are not known, nor of what was known before.
+    """
+    size = np.bincount(group)
+    found = np.zeros(len(size), dtype=bool)
+    if instances.footprint is None or len(links.first) == 0:
+        return found
+    ends = np.column_stack([group[links.first], group[links.second]])
+    few, many = np.where((size[ends[:, 0]] < size[ends[:, 1]])[:, None], ends, ends[:, ::-1]).T
+    middle = shapely.centroid(polygons)
+    looked = shapely.contains(instances.footprint[instance[links.first]], middle[links.second])
+    looked &= shapely.contains(instances.footprint[instance[links.second]], middle[links.first])
+    share = np.where(looked & (links.metres > 0), 1.0 - (1.0 - OVERLAP) * links.square, 0.0)
+    table = pd.DataFrame({"few": few, "many": many, "share": share, "both": links.side_by_side})
+    table = table.groupby(["few", "many"], sort=True).sum().reset_index()
+    one, other = size[table["few"]], size[table["many"]]
+    shadow = (table["share"] >= _SHADOW * one * other) & (other >= _MANY * one) & (table["both"] <= SIDE_BY_SIDE * one)
+    found[table["few"][shadow]] = True
+    found[group[instance == instances.known]] = False
+    return found
 
 
 def _join_cut(

@@ -20,7 +20,8 @@ from polymerge_core.consensus.looks import Looks
 from polymerge_core.curves import Array, Index
 
 #: Groups that more than this share of the local maps of the smaller one saw side by side are different lines. Fewer
-#: only drew one twice, or invented one beside it. A local map that saw them so over half their length counts half.
+#: only drew one twice, or invented one beside it. A local map that saw them so over half their length counts half. When
+#: groups are complete it is the share of the metres of the shorter one.
 SIDE_BY_SIDE = 0.4
 
 
@@ -93,22 +94,24 @@ def link_groups(instance: Index, size: Array, links: Links, unit: float) -> Inde
     """
     group = np.arange(len(instance))
     seen = csr_array((size, (group, instance)), shape=(len(group), int(instance.max(initial=0)) + 1))
-    while True:
-        # What is too far apart with all that it has links with stays so: a mean lies between what it is the mean of.
-        cost = _costs(links, unit)
-        open_to = np.zeros(seen.shape[0], dtype=bool)
-        for end in (links.first, links.second):
-            open_to[end[cost < 1.0]] = True
-        alive = open_to[links.first] & open_to[links.second]
-        links, cost = links.take(alive), cost[alive]
-        near = _mutually_nearest(links, np.where(_apart(links, seen), np.inf, cost), seen.shape[0])
-        if len(near) == 0:
-            return pd.factorize(group)[0]
-        into = np.arange(seen.shape[0])
-        into[links.second[near]] = links.first[near]
-        kept, new = np.unique(into, return_inverse=True)
-        group, links = new[group], _joined(links, new)
-        seen = csr_array((np.ones(len(new)), (new, np.arange(len(new)))), shape=(len(kept), len(new))) @ seen
+    for apart in (_apart, _apart_at_length):
+        while True:
+            # What is too far apart with all that it has links with stays so: a mean lies between what it is made of.
+            cost = _costs(links, unit)
+            open_to = np.zeros(seen.shape[0], dtype=bool)
+            for end in (links.first, links.second):
+                open_to[end[cost < 1.0]] = True
+            alive = open_to[links.first] & open_to[links.second]
+            links, cost = links.take(alive), cost[alive]
+            near = _mutually_nearest(links, np.where(apart(links, seen), np.inf, cost), seen.shape[0])
+            if len(near) == 0:
+                break
+            into = np.arange(seen.shape[0])
+            into[links.second[near]] = links.first[near]
+            kept, new = np.unique(into, return_inverse=True)
+            group, links = new[group], _joined(links, new)
+            seen = csr_array((np.ones(len(new)), (new, np.arange(len(new)))), shape=(len(kept), len(new))) @ seen
+    return pd.factorize(group)[0]
 
 
 def _costs(links: Links, unit: float) -> Array:
@@ -129,6 +132,16 @@ def _apart(links: Links, seen: csr_array) -> NDArray[np.bool_]:
     few = np.minimum(*(np.diff(seen.indptr)[end] for end in (first, second)))
     found[rows] = np.minimum(1.0, links.side_by_side[rows] / length) * count > SIDE_BY_SIDE * few
     return found
+
+
+def _apart_at_length(links: Links, seen: csr_array) -> NDArray[np.bool_]:
+    """Tell whether much of the shorter group, in metres, was seen side by side with the other.
+
+    Where lines fork, looks at the one that runs on may have gone to the group of the short one that ends there, which
+    many saw beside it: then two groups show the one that runs on, and hardly any of its metres were seen twice.
+    """
+    length = seen.sum(axis=1)
+    return np.asarray(links.side_by_side > SIDE_BY_SIDE * np.minimum(length[links.first], length[links.second]))
 
 
 def _mutually_nearest(links: Links, cost: Array, count: int) -> Index:

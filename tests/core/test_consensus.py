@@ -15,7 +15,7 @@ from shapely.ops import substring
 import polymerge_core as pm
 from benchmarks.scenarios import town
 from polymerge_core.consensus.alongside import pairs_alongside
-from polymerge_core.consensus.association import associate
+from polymerge_core.consensus.association import Links, associate, link_groups
 from polymerge_core.consensus.axes import Axes, smooth
 from polymerge_core.consensus.drift import estimate_drift
 from polymerge_core.consensus.looks import Instances, Looks
@@ -401,6 +401,41 @@ def test_association_puts_the_closest_together():
     assert group.tolist() == [0, 0, 1, 1]
 
 
+def grouped(size, instance, pairs):
+    """Group looks of given lengths; `pairs` has the metres, the square distance, and the metres seen side by side."""
+    keys = sorted(pairs)
+    metres, square, side = np.array([pairs[key] for key in keys]).T
+    first, second = np.array(keys).T
+    links = Links(first, second, metres * square, metres, np.zeros(len(keys)), side)
+    return link_groups(np.array(instance), np.array(size, dtype=float), links, 1.0)
+
+
+def test_looks_at_a_line_that_went_to_the_group_of_its_branch_come_back():
+    """Eight drives saw a line, six of them a short branch beside it, too; two looks lie nearest to the branches."""
+    lines, branches = range(8), range(8, 14)
+    size, instance = [60.0] * 8 + [12.0] * 6, [*range(8), *range(6)]
+    pairs = {(one, other): (60.0, 0.04, 0.0) for one in lines for other in lines if one < other}
+    pairs |= {(one, other): (60.0, 0.5, 0.0) for one in range(6) for other in (6, 7)}
+    pairs |= {(one, other): (12.0, 0.01, 0.0) for one in branches for other in branches if one < other}
+    pairs |= {(line, branch): (12.0, 0.6, 0.0) for line in range(6) for branch in branches if branch - 8 != line}
+    pairs |= dict.fromkeys(zip(range(6), branches, strict=True), (0.0, 0.0, 12.0))
+    pairs |= {(line, branch): (12.0, 0.02, 0.0) for line in (6, 7) for branch in branches}
+    group = grouped(size, instance, pairs)
+    assert len(set(group[:8].tolist())) == 1
+
+
+def test_two_lines_that_most_local_maps_saw_side_by_side_stay_two_however_near_they_are():
+    drives = range(8)
+    pairs = {}
+    for one in drives:
+        for other in drives:
+            if one < other:
+                pairs |= {(one, other): (60.0, 0.04, 0.0), (8 + one, 8 + other): (60.0, 0.04, 0.0)}
+            pairs[one, 8 + other] = (0.0, 0.0, 50.0) if one == other else (60.0, 0.05, 0.0)
+    group = grouped([60.0] * 16, [*drives, *drives], pairs)
+    assert group.tolist() == [0] * 8 + [1] * 8
+
+
 def test_two_lines_that_fork_stay_two_where_one_local_map_saw_both():
     upper = [(6.8, 11.7), (8.1, 10.8), (10.0, 9.5), (11.9, 8.5), (13.2, 7.3)]
     lower = [(4.0, 10.4), (6.9, 9.2), (8.5, 8.3), (10.4, 7.0), (12.8, 5.6)]
@@ -589,6 +624,33 @@ def test_a_crossing_cut_off_at_the_edge_of_what_was_looked_at_joins_the_whole_on
     result = merge_crossings([*wide, sliver], footprints)
     assert len(result.elements) == 1
     assert shapely.Polygon(result.elements.geometry.iloc[0]).area == pytest.approx(32.0, rel=0.03)
+
+
+class TestACrossingThatFewSawBesideWhereManySawIt:
+    MANY, FEW = 9, 3
+    AREA = shapely.box(-20, -20, 20, 20)
+
+    def merged(self, *more, footprints=True):
+        """Return the merge of many looks at a crossing, few at one half beside it, and of `more`, by local map."""
+        shapes = [shapely.box(0.0, 0.1 * n, 4.0, 12.0 + 0.1 * n) for n in range(self.MANY)]
+        shapes += [shapely.box(2.6, 0.1 * n, 6.6, 12.0 + 0.1 * n) for n in range(self.FEW)]
+        names = [*range(self.MANY + self.FEW), *(name for name, _ in more)]
+        rings = [shape.exterior for shape in [*shapes, *(shape for _, shape in more)]]
+        layer = looks(*rings, cls="ped_crossing", instance=names)
+        return merge(local_maps(layer, [self.AREA] * (self.MANY + self.FEW)) if footprints else layer)
+
+    def test_is_that_one_seen_badly(self):
+        result = self.merged()
+        assert len(result.elements) == 1
+        assert result.elements.geometry.iloc[0].bounds == pytest.approx((0.0, 0.4, 4.0, 12.4), abs=0.1)
+        assert result.left_out["reason"].tolist() == ["seen by too few of the local maps that looked there"] * self.FEW
+
+    def test_is_another_one_where_they_saw_both(self):
+        both = [(self.MANY + n, shapely.box(0.0, 0.1 * n, 4.0, 12.0 + 0.1 * n)) for n in range(2)]
+        assert len(self.merged(*both).elements) == 2
+
+    def test_is_another_one_where_nobody_knows_who_looked(self):
+        assert len(self.merged(footprints=False).elements) == 2
 
 
 def test_of_crossings_that_all_were_cut_off_the_corners_that_were_seen_are_averaged():

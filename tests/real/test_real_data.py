@@ -11,7 +11,8 @@ import shapely
 
 import polymerge_core as pm
 from benchmarks import simulate_drive
-from benchmarks.scenarios import av2_scenarios
+from benchmarks.dynamics import drives
+from benchmarks.scenarios import PITTSBURGH, av2_road, av2_scenarios
 from polymerge_core.__main__ import main
 from polymerge_core.io import read_table
 from tests.core.test_consensus_state import distances, some
@@ -135,3 +136,14 @@ def test_what_is_known_and_what_is_added_give_what_both_give_at_once(real_data):
         apart.append(distances(together, pm.accumulate(parts[1], pm.accumulate(parts[0])).elements()))
     assert np.median(np.concatenate(apart)) <= 0.05
     assert np.quantile(np.concatenate(apart), 0.95) <= 0.20
+
+
+@pytest.mark.parametrize("last", [18, 45])
+def test_sixteen_drives_past_a_fork_draw_each_divider_once(real_data, last):
+    """A short divider runs into a long one; looks at either went to the other, and the long one was drawn twice."""
+    road = av2_road(real_data, PITTSBURGH)
+    local = [maps for drive in drives(road, road, 7, None, last)[-16:] for maps in drive.local]
+    merged = pm.merge(local).elements
+    result = pm.evaluate(merged, road.truth, local_maps=local[:1])
+    assert result.value("divider", "duplication") <= 1.05
+    assert result.value("divider", "fragments") <= 1.05
