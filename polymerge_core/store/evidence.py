@@ -409,13 +409,18 @@ def still_valid(context: Context) -> Pieces:
     return Pieces(LocalMaps(observations, known, source="map"), footprints, own.index.to_numpy(), offset, table)
 
 
+def as_area(shape: BaseGeometry) -> BaseGeometry:
+    """Return the area of an element of an area class, which may be drawn as a line."""
+    ring = as_lines(np.array([shape], dtype=object))[0]
+    return shapely.make_valid(shapely.polygons(shapely.get_coordinates(ring)))
+
+
 def _rest(shape: BaseGeometry, zone: BaseGeometry, *, is_area: bool) -> list[tuple[float, float]]:
     """Return the stretches of a line outside of a zone; an area is in it for the most part, or not at all."""
     if is_area:
-        ring = as_lines(np.array([shape], dtype=object))[0]
-        area = shapely.make_valid(shapely.polygons(shapely.get_coordinates(ring)))
+        area = as_area(shape)
         inside = shapely.area(shapely.intersection(area, zone)) > shapely.area(area) / 2
-        return [] if inside else [(0.0, float(ring.length))]
+        return [] if inside else [(0.0, float(as_lines(np.array([shape], dtype=object))[0].length))]
     return [(each.start, each.stop) for each in stretches_of(shape, zone, inside=False)]
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from polymerge_core.schema import NO_ELEMENT
 from polymerge_core.store.element_table import displacement
-from polymerge_core.store.evidence import Context
+from polymerge_core.store.evidence import Context, as_area
 from polymerge_core.store.shapes import Shape, by_piece
 
 
@@ -66,6 +66,36 @@ def assign_ids(
     into = dict(zip(kept["element_id"].tolist(), ids[kept["shape"].to_numpy(dtype=np.intp)].tolist(), strict=True))
     gone = {int(old): into.get(int(old), NO_ELEMENT) for old in stored.index}
     return ids, {old: now for old, now in gone.items() if old != now}
+
+
+def gone_into_areas(
+    shapes: list[Shape], ids: NDArray[np.int64], areas: gpd.GeoDataFrame, gone: dict[int, int]
+) -> dict[int, int]:
+    """Return areas that are no more, and that area in which most of each lies: there cannot be two at one place.
+
+    Parameters
+    ----------
+    shapes : list of Shape
+        As they come out.
+    ids : ndarray of int
+        Their ids.
+    areas : GeoDataFrame
+        The elements of the map that met the place and are areas, by their id.
+    gone : dict of int to int
+        From `assign_ids`.
+    """
+    found = {}
+    for own in areas.index[[gone.get(int(old)) == NO_ELEMENT for old in areas.index]]:
+        cls, polygon = areas.loc[own, "class"], as_area(areas.geometry[own])
+        common = {
+            int(ids[row]): float(shapely.area(shapely.intersection(polygon, as_area(shape.line))))
+            for row, shape in enumerate(shapes)
+            if shape.cls == cls and shapely.intersects(polygon, shape.line)
+        }
+        most = min(common, key=lambda other: (-round(common[other], 6), other), default=None)
+        if most is not None and common[most] > shapely.area(polygon) / 2:
+            found[int(own)] = most
+    return found
 
 
 def _beside(shapes: list[Shape], kept: pd.DataFrame, stored: gpd.GeoDataFrame, reach: float) -> pd.DataFrame:

@@ -24,7 +24,7 @@ from polymerge_core.store.beliefs import DENIED, Renewal, judge_elements
 from polymerge_core.store.drive_order import order_drives
 from polymerge_core.store.element_table import Counts, count_looks, displacement, read_elements, write_elements
 from polymerge_core.store.evidence import Context, read_context, with_renewed
-from polymerge_core.store.identity import assign_ids, count_votes
+from polymerge_core.store.identity import assign_ids, count_votes, gone_into_areas
 from polymerge_core.store.lineage import attribute, list_unheard, read_lineage, share_out
 from polymerge_core.store.merging import Merged, merge_all, newest, without
 from polymerge_core.store.shapes import as_table, assemble, is_area
@@ -79,6 +79,7 @@ def redraw(
     votes = count_votes(merged.lineage, context, before)
     reach, first = REACH * settings.proximity, geopackage.next_id(connection, "elements")
     ids, gone = assign_ids(shapes, stored, votes, reach, first)
+    gone |= gone_into_areas(shapes, ids, stored[is_area(stored, settings)], gone)
     attribute(connection, place, context, merged, stored, shapes, ids, votes, gone)
     share_out(connection, shapes, ids, stored)
     drawn = as_table(shapes, ids, merged.elements, stored, settings)

@@ -12,7 +12,9 @@ import shapely
 from shapely import LineString, box
 
 import polymerge_core as pm
+from polymerge_core.store.identity import gone_into_areas
 from polymerge_core.store.movement import _steps
+from polymerge_core.store.shapes import Shape
 
 CRS = "EPSG:32632"
 ORIGIN = np.array([500_000.0, 5_000_000.0])
@@ -274,6 +276,19 @@ def test_a_drive_that_did_not_see_a_line_says_nothing_of_where_it_lies():
     assert told[0, 1] > 100
     np.testing.assert_allclose(with_others[0, 2:4], told[0, 1:3])
     assert np.isneginf(np.delete(with_others[0], [2, 3])).all()
+
+
+@pytest.mark.parametrize(("west", "into"), [(1.5, 7), (3.0, -1)], ids=["in another one", "beside it"])
+def test_an_area_that_is_no_more_and_lies_in_another_one_went_into_that(west, into):
+    nothing = np.empty(0, np.intp)
+    rings = [
+        LineString(box(*bounds).exterior.coords) for bounds in ((0, 0, 4, 12), (0, 20, 4, 32), (west, 0, west + 4, 12))
+    ]
+    shapes = [Shape("ped_crossing", ring, nothing, nothing, nothing, nothing) for ring in rings[:2]]
+    shapes.append(Shape("divider", rings[2], nothing, nothing, nothing, nothing))
+    stored = gpd.GeoDataFrame({"class": ["ped_crossing"] * 2}, geometry=[rings[2], rings[1]], index=[5, 6])
+    gone = {5: -1, 6: 6}
+    assert gone | gone_into_areas(shapes, np.array([7, 8, 9]), stored, gone) == {5: into, 6: 6}
 
 
 def test_undoing_the_drives_that_saw_a_line_vanish_brings_it_back(known):
