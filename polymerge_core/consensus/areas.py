@@ -120,7 +120,7 @@ def merge_looks_at_areas(
     past = np.zeros((len(shapes), len(Support._fields)))
     np.add.at(past, group[count:], before.support)
     support = Support._make(new + old for new, old in zip(support, past.T, strict=True))
-    kept = support.enough & ~_shadows(polygons, instance, instances, links, group)
+    kept = support.enough & ~_shadows(polygons, instance, instances, links, group, whole)
     number = np.where(kept, np.cumsum(kept) - 1, -1)
     known = KnownAreas(
         shapes,
@@ -167,11 +167,16 @@ def group_areas(
 
 
 def _shadows(
-    polygons: NDArray[np.object_], instance: Index, instances: Instances, links: Links, group: Index
+    polygons: NDArray[np.object_],
+    instance: Index,
+    instances: Instances,
+    links: Links,
+    group: Index,
+    whole: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     """Tell which areas are no areas of their own, but others seen badly.
 
-    None where footprints are not known, nor of what was known before.
+    None where footprints are not known, nor of what was known before; how far goes what all saw cut off nobody knows.
     """
     size = np.bincount(group)
     found = np.zeros(len(size), dtype=bool)
@@ -188,6 +193,7 @@ def _shadows(
     one, other = size[table["few"]], size[table["many"]]
     shadow = (table["share"] >= _SHADOW * one * other) & (other >= _MANY * one) & (table["both"] <= SIDE_BY_SIDE * one)
     found[table["few"][shadow]] = True
+    found &= np.bincount(group, whole) > 0
     found[group[instance == instances.known]] = False
     return found
 
