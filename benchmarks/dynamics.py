@@ -16,7 +16,6 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ import polymerge_core as pm
 from benchmarks.noise import Noise
 from benchmarks.scenarios import MIAMI, PITTSBURGH, Road, Scenario, av2_road, deecamp, town_road
 from polymerge_core.observations import as_lines
+from polymerge_core.store.evidence import as_area
 
 #: The road changes after so many drives, and is looked at after so many.
 CHANGED_AFTER, LOOKED_AT, DRIVES = 2, 5, 8
@@ -192,10 +192,14 @@ def unchanged(road: Road, seed: int, count: int, path: Path) -> dict[str, Any]:
         done = store.update(drive.local)
         if before is not None:
             now = store.changes(done.revision - 1)
-            gone = {kind: before["element_id"].isin(now.loc[now["kind"] == kind, "element_id"]) for kind in lost}
-            lost["retired"] += int(gone["retired"].sum())
-            lost["of these really there"] += sum(is_there(*each, road) for each in _told(before[gone["retired"]]))
-            lost["merged"] += int(gone["merged"].sum())
+            retired, merged = (
+                before[before["element_id"].isin(now.loc[now["kind"] == kind, "element_id"])]
+                for kind in ("retired", "merged")
+            )
+            lost["retired"] += len(retired)
+            told = zip(retired["class"], retired.geometry, strict=True)
+            lost["of these really there"] += sum(is_there(cls, shape, road) for cls, shape in told)
+            lost["merged"] += len(merged)
     kinds = renewals(store.path)["kind"].value_counts().to_dict()
     return {"confirmed elements lost": lost, "taken for changes": kinds, "elements": len(store.elements())}
 
@@ -204,14 +208,10 @@ def is_there(cls: str, shape: shapely.Geometry, road: Road) -> bool:
     """Return whether an element is really there: half of an area within one of the road's, half of a line along one."""
     true = road.truth.geometry[road.truth["class"] == cls].to_numpy()
     if cls == "ped_crossing":
-        shape, true = shapely.Polygon(shape), np.array([shapely.Polygon(line) for line in as_lines(true)])
-        return bool(shapely.area(shapely.intersection(true, shape)).max(initial=0.0) > 0.5 * shape.area)
+        area, areas = as_area(shape), np.array([as_area(each) for each in true])
+        return bool(shapely.area(shapely.intersection(areas, area)).max(initial=0.0) > 0.5 * area.area)
     along = shapely.intersection(shape, shapely.union_all(shapely.buffer(true, _THERE)))
     return bool(along.length > 0.5 * shape.length)
-
-
-def _told(elements: gpd.GeoDataFrame) -> Iterator[tuple[str, shapely.Geometry]]:
-    return zip(elements["class"], as_lines(elements.geometry.to_numpy()), strict=True)
 
 
 def apart(one: gpd.GeoDataFrame, other: gpd.GeoDataFrame) -> dict[str, float]:
